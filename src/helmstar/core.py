@@ -1,0 +1,162 @@
+"""The whole vocabulary: what a state, a process, a sensor, a measurement, a belief and a filter are.
+
+Everything composes from the types below. Functions in them live at module level and are static (they are part of what
+is compiled); parameters are data (a new tuning never compiles again). Any model meets any filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Protocol
+
+from .backend import jax, jnp
+from .geometry.retraction import Retraction
+
+Array = jax.Array
+State = Any  # any pytree: an array, or a frozen dataclass registered with `pytree`
+
+
+def pytree(cls: type | None = None, *, static: tuple[str, ...] = ()):
+    """Class decorator: a frozen dataclass whose fields are JAX data, but for those named in `static`."""
+
+    def wrap(c: type) -> type:
+        c = dataclass(frozen=True)(c)
+        names = [f for f in c.__dataclass_fields__ if f not in static]
+        return jax.tree_util.register_dataclass(c, data_fields=names, meta_fields=list(static))
+
+    return wrap if cls is None else wrap(cls)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Driving noise w of a process: `cov(params, x, u, dt)` is its covariance (dim, dim) over one step."""
+
+    cov: Callable[[Any, State, Any, Array], Array]
+    dim: int
+
+
+@partial(pytree, static=("step", "noise", "jacobian"))
+class Process:
+    """x' = step(params, x, u, dt, w). `jacobian(params, x, u, dt)` returns (F, G) for the model's retraction, or is None:
+    then both come from automatic differentiation at the retraction's zero. F = d(x' [-] x0')/d xi, G = d(x' [-] x0')/d w,
+    where a G of None stands for the identity."""
+
+    step: Callable[[Any, State, Any, Array, Array], State]
+    noise: Noise
+    params: Any
+    jacobian: Callable[[Any, State, Any, Array], tuple[Array, Array | None]] | None = None
+
+
+@partial(pytree, static=("predict", "minus", "cov", "jacobian"))
+class Sensor:
+    """z = predict(params, x, a) (+) noise of covariance cov(params, x, a); minus(z, z_hat) is the residual vector (m,).
+
+    `a` is the step's context (which stars, their weights). `jacobian(params, x, a)` is d(residual)/d xi, (m, dim), for
+    the model's retraction, or None: then it comes from automatic differentiation.
+    """
+
+    predict: Callable[[Any, State, Any], Any]
+    minus: Callable[[Any, Any], Array]
+    cov: Callable[[Any, State, Any], Array]
+    params: Any
+    jacobian: Callable[[Any, State, Any], Array] | None = None
+
+
+@pytree
+class Measurement:
+    """One slot of one sensor at one step: value z, context a, mask (k,) of bool; m residuals belong to k entries in order.
+
+    All False is an absent measurement. Values under a False mask may be anything, NaN included.
+    """
+
+    z: Any
+    a: Any
+    mask: Array
+
+
+@pytree
+class Gaussian:
+    """Belief: mean, and covariance in the tangent space at the mean, in the retraction's error (truth [-] mean)."""
+
+    mean: State
+    cov: Array
+
+
+@pytree
+class Predicted:
+    """What a smoother needs of a prediction: the predicted belief and F = d(predicted error)/d(previous error)."""
+
+    mean: State
+    cov: Array
+    F: Array
+
+
+ABSENT, ACCEPTED, GATED, REOPENED, RESET = range(5)
+"""Status of an update: no measurement; used; refused by the gate; refused once too often, so that the covariance was
+grown to open the gate again; belief started anew."""
+
+
+@pytree
+class Info:
+    """Of one update: residual (m,) with masked entries zero, its covariance S (m, m), NIS = r^T S^-1 r, degrees of
+    freedom, log likelihood, status (one of the codes above)."""
+
+    residual: Array
+    S: Array
+    nis: Array
+    dof: Array
+    loglik: Array
+    status: Array
+
+
+@pytree
+class Gate:
+    """Chi-square gate. limits[m] is the largest NIS taken for m degrees of freedom (inf: no gate).
+
+    At the `reopen_after`-th refusal of a sensor in a row, and at each one after it, the belief's covariance grows by
+    NIS over its degrees of freedom (status REOPENED), so that the gate opens for the measurements that follow.
+    """
+
+    limits: Array
+    reopen_after: Array
+
+
+class Filter(Protocol):
+    """Pure functions over a belief. A filter is hashable, so that equal filters share one compiled program."""
+
+    retraction: Retraction
+
+    def predict(self, belief: Any, process: Process, u: Any, dt: Array) -> tuple[Any, Predicted]: ...
+
+    def update(
+        self, belief: Any, sensor: Sensor, measurement: Measurement, gate: Gate, refused: Array
+    ) -> tuple[Any, Info]: ...
+
+
+@partial(pytree, static=("retraction",))
+class Model:
+    """A retraction, a process and the sensors that belong together (their analytic Jacobians share the retraction)."""
+
+    retraction: Retraction
+    process: Process
+    sensors: tuple[Sensor, ...] = field(default=())
+
+
+def no_gate(max_dof: int = 64) -> Gate:
+    """The gate that takes everything."""
+    return Gate(limits=jnp.full((max_dof + 1,), jnp.inf), reopen_after=jnp.asarray(0))
+
+
+def chi_square_gate(probability: float, max_dof: int = 64, reopen_after: int = 5) -> Gate:
+    """Gate that refuses a consistent measurement with the given probability.
+
+    Raises ValueError for a probability outside (0, 1).
+    """
+    from scipy.stats import chi2
+
+    if not 0.0 < probability < 1.0:
+        raise ValueError(f"gate probability {probability!r}: must lie between 0 and 1, such as 1e-6")
+    limits = chi2.isf(probability, df=range(1, max_dof + 1))
+    return Gate(limits=jnp.concatenate([jnp.zeros(1), jnp.asarray(limits)]), reopen_after=jnp.asarray(reopen_after))

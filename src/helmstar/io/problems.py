@@ -1,0 +1,75 @@
+"""What was wrong in a data file, where, and what was done about it: one `Problem` per bad row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import DataError
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One bad row of a file. `row` is the line number in a CSV (1-based), the data row (1-based) in Parquet.
+
+    kind: "nan", "not_a_number", "ragged", "non_unit", "time_unreadable", "time_backwards", "time_repeated", "frame",
+    "jump" or "unit". action: "dropped", "normalised" or "converted". `rows` is how many rows it stands for: 1, or more
+    where a file has so many of a kind that the rest are summed up, or where a whole range is concerned.
+    """
+
+    file: str
+    row: int
+    kind: str
+    message: str
+    action: str
+    rows: int = 1
+
+    def __str__(self) -> str:
+        return f"{self.file}, row {self.row}: {self.message} ({self.action})"
+
+
+class ProblemLog:
+    """Collects problems; of each (file, kind, action) the first `limit` rows are named, the rest summed up."""
+
+    def __init__(self, limit: int = 1000) -> None:
+        self._limit = limit
+        self._named: list[Problem] = []
+        self._count: dict[tuple[str, str, str], int] = {}
+        self._unnamed: dict[tuple[str, str, str], tuple[int, int, int]] = {}
+
+    def add(self, file: str, row: np.ndarray, kind: str, message: str | Callable[[int], str], action: str) -> None:
+        """Note the rows with these numbers; `message` may be a function of the index into `row`."""
+        key = (file, kind, action)
+        free = max(self._limit - self._count.get(key, 0), 0)
+        self._count[key] = self._count.get(key, 0) + len(row)
+        for i, number in enumerate(row[:free].tolist()):
+            text = message if isinstance(message, str) else message(i)
+            self._named.append(Problem(file, number, kind, text, action))
+        if len(row) > free:
+            rest = row[free:]
+            first, last, rows = self._unnamed.get(key, (int(rest.min()), int(rest.max()), 0))
+            first, last = min(first, int(rest.min())), max(last, int(rest.max()))
+            self._unnamed[key] = (first, last, rows + len(rest))
+
+    def problems(self) -> tuple[Problem, ...]:
+        """All of them, by file in the order of first appearance, then by row."""
+        summed = [
+            Problem(file, first, kind, f"{rows} more rows like this ({kind}) up to row {last}", action, rows)
+            for (file, kind, action), (first, last, rows) in self._unnamed.items()
+        ]
+        everything = self._named + summed
+        order = {file: i for i, file in enumerate(dict.fromkeys(problem.file for problem in everything))}
+        return tuple(sorted(everything, key=lambda problem: (order[problem.file], problem.row)))
+
+
+def refuse(problems: Sequence[Problem], show: int = 5) -> None:
+    """Raise a DataError that lists the first few problems, if there are any: what `--strict` does."""
+    if problems:
+        total = sum(problem.rows for problem in problems)
+        lines = [f"  {problem}" for problem in problems[:show]]
+        more = [f"  ... and {len(problems) - show} more"] if len(problems) > show else []
+        head = f"{total} bad row{'s' if total > 1 else ''}, and strict reading allows none:"
+        tail = "Mend the file, or read it without --strict: bad rows are then handled as said in brackets."
+        raise DataError("\n".join([head, *lines, *more, tail]))
