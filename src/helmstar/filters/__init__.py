@@ -1,0 +1,23 @@
+"""Floor 2: every filter once, for every model. Variants are retractions."""
+
+from .ekf import ErrorStateKalmanFilter
+from .run import Track, run, step
+from .smoother import smooth, smooth_step
+from .static import StaticSolver, wahba_start
+from .ukf import Spread, UnscentedBelief, UnscentedKalmanFilter, kappa_form, scaled
+
+__all__ = [
+    "ErrorStateKalmanFilter",
+    "Spread",
+    "StaticSolver",
+    "Track",
+    "UnscentedBelief",
+    "UnscentedKalmanFilter",
+    "kappa_form",
+    "run",
+    "scaled",
+    "smooth",
+    "smooth_step",
+    "step",
+    "wahba_start",
+]

@@ -89,10 +89,13 @@ class Instants:
         """Those at an index or mask."""
         return Instants(self.day[index], self.second[index], self.absolute)
 
+    def seconds(self) -> np.ndarray:
+        """Seconds since the first of them in storage order."""
+        return (self.day - self.day[:1]) * DAY_S + (self.second - self.second[:1])
+
     def earliest(self) -> Origin:
-        """The first of at least one time."""
-        here = Origin(int(self.day[0]), float(self.second[0]), self.absolute)
-        first = int(np.argmin(self.since(here)))
+        """The first in time, of at least one."""
+        first = int(np.argmin(self.seconds()))
         return Origin(int(self.day[first]), float(self.second[first]), self.absolute)
 
 

@@ -58,21 +58,29 @@ class ColumnsConfiguration(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     file: str | None = Field(
-        None, description="files this map is for, as a pattern such as 'gyro_*.csv'; all if absent"
+        default=None, description="files this map is for, as a pattern such as 'gyro_*.csv'; all if absent"
     )
-    time: str | None = Field(None, description="column with the time")
-    clock_scale: Scale | None = Field(None, description="what the time counts; 's' is any clock of plain seconds")
+    time: str | None = Field(default=None, description="column with the time")
+    clock_scale: Scale | None = Field(
+        default=None, description="what the time counts; 's' is any clock of plain seconds"
+    )
     clock_unit_s: float | None = Field(
-        None, gt=0, allow_inf_nan=False, description="seconds per unit of a numeric time"
+        default=None, gt=0, allow_inf_nan=False, description="seconds per unit of a numeric time"
     )
-    gyro: Triple | None = Field(None, description="columns with the rates about x, y, z")
-    gyro_unit: GyroUnit | None = Field(None, description="unit of the gyro columns; rad, deg, arcsec are increments")
-    gyro_frame: Literal["body", "base"] = Field("body", description="axes of the rates: body, or inertial (base)")
-    quaternion: Quadruple | None = Field(None, description="columns with the quaternion, in the order below")
-    quaternion_order: Literal["xyzw", "wxyz"] = Field("xyzw", description="where the scalar w stands in `quaternion`")
-    quaternion_sense: Literal["bn", "nb"] = Field("bn", description="bn: v_B = R(q) v_N; nb: v_N = R(q) v_B")
-    star_b: Triple | None = Field(None, description="columns with the star's direction in body axes")
-    star_n: Triple | None = Field(None, description="columns with the star's direction in inertial axes")
+    gyro: Triple | None = Field(default=None, description="columns with the rates about x, y, z")
+    gyro_unit: GyroUnit | None = Field(
+        default=None, description="unit of the gyro columns; rad, deg, arcsec are increments"
+    )
+    gyro_frame: Literal["body", "base"] = Field(
+        default="body", description="axes of the rates: body, or inertial (base)"
+    )
+    quaternion: Quadruple | None = Field(default=None, description="columns with the quaternion, in the order below")
+    quaternion_order: Literal["xyzw", "wxyz"] = Field(
+        default="xyzw", description="where the scalar w stands in `quaternion`"
+    )
+    quaternion_sense: Literal["bn", "nb"] = Field(default="bn", description="bn: v_B = R(q) v_N; nb: v_N = R(q) v_B")
+    star_b: Triple | None = Field(default=None, description="columns with the star's direction in body axes")
+    star_n: Triple | None = Field(default=None, description="columns with the star's direction in inertial axes")
 
     @model_validator(mode="after")
     def _order_needs_names(self) -> ColumnsConfiguration:
@@ -111,7 +119,7 @@ def map_for(file: str, maps: Sequence[ColumnsConfiguration]) -> ColumnsConfigura
     for entry in maps:
         if entry.file is None or fnmatch(name, entry.file) or fnmatch(file, entry.file):
             return entry
-    return ColumnsConfiguration()  # pyright: ignore[reportCallIssue]
+    return ColumnsConfiguration()
 
 
 def resolve(file: str, found: Sequence[str], given: ColumnsConfiguration) -> Layout:

@@ -31,35 +31,30 @@ class Problem:
 
 
 class ProblemLog:
-    """Collects problems; of each (file, kind, action) the first `limit` rows are named, the rest summed up."""
+    """Collects problems, each row of a file once per kind; of a file, kind and action the first `limit` are named."""
 
     def __init__(self, limit: int = 1000) -> None:
         self._limit = limit
         self._named: list[Problem] = []
-        self._count: dict[tuple[str, str, str], int] = {}
-        self._unnamed: dict[tuple[str, str, str], tuple[int, int, int]] = {}
+        self._rows: dict[tuple[str, str, str], np.ndarray] = {}
 
     def add(self, file: str, row: np.ndarray, kind: str, message: str | Callable[[int], str], action: str) -> None:
         """Note the rows with these numbers; `message` may be a function of the index into `row`."""
         key = (file, kind, action)
-        free = max(self._limit - self._count.get(key, 0), 0)
-        self._count[key] = self._count.get(key, 0) + len(row)
-        for i, number in enumerate(row[:free].tolist()):
+        known = self._rows.get(key, np.empty(0, dtype=np.int64))
+        new = np.flatnonzero(~np.isin(row, known))
+        self._rows[key] = np.concatenate([known, row[new]])
+        for i in new[: max(self._limit - len(known), 0)].tolist():
             text = message if isinstance(message, str) else message(i)
-            self._named.append(Problem(file, number, kind, text, action))
-        if len(row) > free:
-            rest = row[free:]
-            first, last, rows = self._unnamed.get(key, (int(rest.min()), int(rest.max()), 0))
-            first, last = min(first, int(rest.min())), max(last, int(rest.max()))
-            self._unnamed[key] = (first, last, rows + len(rest))
+            self._named.append(Problem(file, int(row[i]), kind, text, action))
 
     def problems(self) -> tuple[Problem, ...]:
         """All of them, by file in the order of first appearance, then by row."""
-        summed = [
-            Problem(file, first, kind, f"{rows} more rows like this ({kind}) up to row {last}", action, rows)
-            for (file, kind, action), (first, last, rows) in self._unnamed.items()
-        ]
-        everything = self._named + summed
+        everything = list(self._named)
+        for (file, kind, action), rows in self._rows.items():
+            if len(rest := rows[self._limit :]):
+                message = f"{len(rest)} more rows like this ({kind}) up to row {rest.max()}"
+                everything.append(Problem(file, int(rest.min()), kind, message, action, len(rest)))
         order = {file: i for i, file in enumerate(dict.fromkeys(problem.file for problem in everything))}
         return tuple(sorted(everything, key=lambda problem: (order[problem.file], problem.row)))
 

@@ -220,7 +220,7 @@ def _parse(file: str, lines: list[str], separator: str, width: int, names: list[
         )
     except (pa.ArrowException, ValueError) as error:
         raise DataError(f"{file}: the table cannot be read: {error}") from error
-    return {name: content.column(i) for i, name in reversed(list(enumerate(names)))}  # of equal names the first
+    return {name: content.column(i) for i, name in enumerate(names)}
 
 
 def _number(text: str) -> float | None:

@@ -6,7 +6,6 @@ quaternions q_BN, scalar last; unit star directions; times in s since the first 
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -15,15 +14,23 @@ from typing import Literal, Self
 import numpy as np
 
 from ..errors import DataError
-from .clock import Instants, Origin, from_numbers, from_texts
-from .columns import UNIT_TO_SI, ColumnsConfiguration, Layout, map_for, resolve
+from .cleaning import Part, clean
+from .clock import Instants, Origin
+from .columns import ColumnsConfiguration
 from .problems import Problem, ProblemLog, refuse
-from .table import Table, read_table
+from .table import read_table
 
-__all__ = ["AttitudeRows", "DirectionRows", "GyroRows", "Problem", "Rows", "Telemetry", "read_telemetry"]
-
-NORM_TOLERANCE = 1e-3  # a quaternion or direction farther from length 1 is damaged, not rounded
-ROUNDING = 1e-6  # a norm this close to 1 is the rounding of printed digits, not worth a word
+__all__ = [
+    "AttitudeRows",
+    "DirectionRows",
+    "GyroRows",
+    "Problem",
+    "Reading",
+    "Rows",
+    "Telemetry",
+    "read_telemetry",
+    "to_rates",
+]
 
 
 @dataclass(frozen=True)
@@ -48,11 +55,30 @@ class Rows:
 class GyroRows(Rows):
     """`value` (n, 3): rad/s, or rad since the row before if `quantity` is "increment", in body axes.
 
-    "rate" is what the column's name or unit says; only sensors.toml's `reading` can say that its numbers are increments.
+    "rate" is what the column's name or unit says; sensors.toml's `reading` may still say that they are increments.
+    `step` (n,) is the time in s that an increment or a mean covers: since the row before in its file, be that row good
+    or bad; NaN for the first row.
     """
 
     value: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    step: np.ndarray = field(default_factory=lambda: np.empty(0))
     quantity: Literal["rate", "increment"] = "rate"
+
+
+Reading = Literal["instant", "mean_since_previous", "increment_rad"]
+
+
+def to_rates(gyro: GyroRows, reading: Reading) -> tuple[GyroRows, Literal["instant", "mean_since_previous"]]:
+    """Gyro rows in rad/s, and how these are to be read; increments become mean rates over the `step` they cover.
+
+    The first increment of a file covers an unknown time; the median step is taken.
+    """
+    if reading != "increment_rad" and gyro.quantity == "rate":
+        return gyro, reading
+    known = gyro.step[np.isfinite(gyro.step)]
+    usual = float(np.median(known)) if len(known) else 1.0
+    step = np.where(np.isfinite(gyro.step), gyro.step, usual)
+    return replace(gyro, value=gyro.value / step[:, None], quantity="rate"), "mean_since_previous"
 
 
 @dataclass(frozen=True)
@@ -82,29 +108,6 @@ class Telemetry:
     origin: Origin
 
 
-@dataclass(frozen=True)
-class _Group:
-    """The usable rows of one kind in one table; `index` points into the table's rows."""
-
-    index: np.ndarray
-    values: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Part:
-    """One table, understood."""
-
-    table: Table
-    layout: Layout
-    instants: Instants
-    gyro: _Group | None
-    quaternion: _Group | None
-    stars: _Group | None
-
-    def groups(self) -> list[_Group]:
-        return [group for group in (self.gyro, self.quaternion, self.stars) if group is not None]
-
-
 def read_telemetry(
     files: Sequence[Path | str],
     columns: ColumnsConfiguration | Sequence[ColumnsConfiguration] | None = None,
@@ -127,7 +130,7 @@ def read_telemetry(
         if names.count(name) > 1:
             raise DataError(f"{name}: the file is given twice; name each file once")
     log = ProblemLog(max_problems)
-    parts = [_understand(read_table(Path(name), max_problems), maps, log) for name in names]
+    parts = [clean(read_table(Path(name), max_problems), maps, log) for name in names]
     origin = _common_origin(parts)
 
     gyro = _gyro_rows(parts, origin, log)
@@ -150,196 +153,16 @@ def read_telemetry(
     return Telemetry(gyro, attitude, directions, problems, _clock_in_words(parts, origin), origin)
 
 
-def _understand(table: Table, maps: Sequence[ColumnsConfiguration], log: ProblemLog) -> _Part:
-    layout = resolve(table.file, list(table.columns), map_for(table.file, maps))
-    instants, timed = _times(table, layout, log)
-    wanted = [names for names in (layout.gyro, layout.quaternion, layout.star_b + layout.star_n) if names]
-    cells = [_cells(table, names, timed, log, combined=len(wanted) > 1) for names in wanted]
-    blank = timed & np.logical_and.reduce([empty for _, _, empty in cells])
-    log.add(table.file, table.row[blank], "nan", "the row holds a time and no values", "dropped")
-
-    groups: dict[tuple[str, ...], _Group] = {}
-    repeats = bool(layout.star_b)  # one row per star: the gyro and attitude beside it stand there once per star
-    for names, (values, good, _) in zip(wanted, cells):
-        stars = names == layout.star_b + layout.star_n
-        if names == layout.quaternion:
-            good, values = _unit_length(table, "the quaternion", values, good, log)
-            if layout.quaternion_sense == "nb":
-                values = values * np.array([-1.0, -1.0, -1.0, 1.0])
-        elif stars:
-            for part, what in ((slice(0, 3), "star_b"), (slice(3, 6), "star_n")):
-                good, values[:, part] = _unit_length(table, f"the direction {what}", values[:, part], good, log)
-        else:
-            values = values * UNIT_TO_SI[layout.gyro_unit]
-        index = np.flatnonzero(good)
-        if repeats and not stars:
-            index = _without_copies(index, instants, values)
-        groups[names] = _Group(*_in_time_order(table, instants, index, values, stars, log))
-    part = _Part(
-        table,
-        layout,
-        instants,
-        gyro=groups.get(layout.gyro),
-        quaternion=groups.get(layout.quaternion),
-        stars=groups.get(layout.star_b + layout.star_n),
-    )
-    if not any(len(group.index) for group in part.groups()):
-        first = next(iter(_in_order((*table.problems, *log.problems()), [table.file])), None)
-        raise DataError(f"{table.file}: none of its {len(table)} rows is usable; the first: {first}")
-    return part
-
-
-def _times(table: Table, layout: Layout, log: ProblemLog) -> tuple[Instants, np.ndarray]:
-    """The time of each row, and which rows have one."""
-    texts = table.texts(layout.time) if layout.scale in ("utc", "tai", "gps") else None
-    numbers = table.numbers(layout.time)
-    numeric = np.isfinite(numbers.value).sum() * 2 > len(table)
-    if layout.scale == "utc" and numeric:
-        raise DataError(
-            f'{table.file}: the time {layout.time!r} is to be UTC, but holds numbers; set clock_scale = "unix" in '
-            '[columns] if they are POSIX seconds, "gps", "tai" or "s" if they count otherwise'
-        )
-    if texts is not None and not numeric:
-        instants, good = from_texts(texts, layout.scale)
-        absent = np.array([text == "" for text in texts.to_pylist()]) & ~good
-    else:
-        instants, good = from_numbers(numbers.value * layout.clock_unit_s, layout.scale)
-        absent = ~numbers.bad & ~np.isfinite(numbers.value)
-    if not good.any():
-        sample = next((text for text in table.texts(layout.time).to_pylist() if text), "nothing")
-        raise DataError(
-            f"{table.file}: no cell of the time {layout.time!r} is a time of scale {layout.scale!r}; one holds "
-            f'{sample[:40]!r}. Set clock_scale in [columns]: "utc", "tai" or "gps" for text such as 2015-06-15T12:00:00.5 '
-            '(only UTC may end in Z), "s", "unix", "gps" or "tai" for numbers'
-        )
-    log.add(table.file, table.row[absent], "nan", f"the time {layout.time} is empty or not finite", "dropped")
-    unreadable = ~good & ~absent
-    cells = table.texts(layout.time).take(np.flatnonzero(unreadable)[:10_000]).to_pylist() if unreadable.any() else []
-
-    def message(i: int) -> str:
-        cell = f"{cells[i][:40]!r}" if i < len(cells) else "a cell"
-        return f"the time {layout.time} holds {cell}, no time of scale {layout.scale!r}"
-
-    log.add(table.file, table.row[unreadable], "time_unreadable", message, "dropped")
-    return instants, good
-
-
-def _cells(
-    table: Table, names: tuple[str, ...], timed: np.ndarray, log: ProblemLog, combined: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values (n, k) of a group of columns, which rows are good, and in which it is absent, for all rows of a table."""
-    columns = [table.numbers(name) for name in names]
-    values = np.stack([column.value for column in columns], axis=1)
-    bad = np.stack([column.bad for column in columns], axis=1)
-    empty = np.stack([column.empty for column in columns], axis=1)
-    nothing = np.isnan(values) & ~bad
-    absent = empty.all(axis=1)
-    if combined and (nothing.all(axis=1) & timed).mean() > 0.1:
-        absent = nothing.all(axis=1)  # so many are no accident: the writer's way of saying "no measurement here"
-
-    def first(mask: np.ndarray, rows: np.ndarray) -> list[str]:
-        return [names[i] for i in np.argmax(mask[rows], axis=1)]
-
-    not_numbers = timed & bad.any(axis=1)
-    blamed = first(bad, not_numbers)
-    text = "{} holds something that is no number".format
-    log.add(table.file, table.row[not_numbers], "not_a_number", lambda i: text(blamed[i]), "dropped")
-
-    not_finite = ~np.isfinite(values)
-    undefined = timed & ~absent & ~not_numbers & not_finite.any(axis=1)
-    blamed_undefined = first(not_finite, undefined)
-    what = np.where(empty[undefined].any(axis=1), "empty", "NaN or infinite")
-    log.add(table.file, table.row[undefined], "nan", lambda i: f"{blamed_undefined[i]} is {what[i]}", "dropped")
-    return values, timed & ~absent & ~not_numbers & ~undefined, absent
-
-
-def _unit_length(
-    table: Table, what: str, values: np.ndarray, good: np.ndarray, log: ProblemLog
-) -> tuple[np.ndarray, np.ndarray]:
-    """Which rows stay, and the values made unit vectors."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        norm = np.linalg.norm(values, axis=1)
-        off = np.abs(norm - 1.0)
-        damaged = good & ~(off <= NORM_TOLERANCE)
-        rounded = good & (off > ROUNDING) & ~damaged
-        unit = np.where((good & ~damaged)[:, None], values / norm[:, None], values)
-    lengths, near = norm[damaged], norm[rounded]
-    log.add(
-        table.file, table.row[damaged], "non_unit", lambda i: f"{what} has length {lengths[i]:.6g}, not 1", "dropped"
-    )
-    log.add(table.file, table.row[rounded], "non_unit", lambda i: f"{what} has length {near[i]:.9g}", "normalised")
-    return good & ~damaged, unit
-
-
-def _without_copies(index: np.ndarray, instants: Instants, values: np.ndarray) -> np.ndarray:
-    """Of consecutive rows with the same time and values the first."""
-    here, before = index[1:], index[:-1]
-    same = (instants.day[here] == instants.day[before]) & (instants.second[here] == instants.second[before])
-    same &= (values[here] == values[before]).all(axis=1)
-    return index[np.concatenate([[True] * (len(index) > 0), ~same]).astype(bool)]
-
-
-def _in_time_order(
-    table: Table, instants: Instants, index: np.ndarray, values: np.ndarray, ties: bool, log: ProblemLog
-) -> tuple[np.ndarray, np.ndarray]:
-    """Drop the fewest rows that leave time increasing (with `ties`: not decreasing), later ones rather than earlier."""
-    if not len(index):
-        return index, values[index]
-    chosen = instants.select(index)
-    time = chosen.since(Origin(int(chosen.day[0]), float(chosen.second[0]), chosen.absolute))
-    keep = _longest_increasing(time, ties)
-    last_kept = np.maximum.accumulate(np.where(keep, np.arange(len(keep)), -1))
-    previous = np.where(last_kept >= 0, time[np.maximum(last_kept, 0)], -np.inf)
-    repeated = ~keep & (time == previous)
-    backwards = ~keep & ~repeated
-    message = "the time is that of the row before"
-    log.add(table.file, table.row[index[repeated]], "time_repeated", message, "dropped")
-    step = (time - previous)[backwards]
-
-    def out_of_order(i: int) -> str:
-        if step[i] > 0.0:
-            return "the time jumps ahead of the rows that follow"
-        return f"the time goes back by {-step[i]:.6g} s"
-
-    log.add(table.file, table.row[index[backwards]], "time_backwards", out_of_order, "dropped")
-    return index[keep], values[index[keep]]
-
-
-def _longest_increasing(time: np.ndarray, ties: bool) -> np.ndarray:
-    """Mask of a longest increasing subsequence (patience sorting from the end, so that earlier rows win ties)."""
-    steps = np.diff(time)
-    if (steps >= 0.0).all() if ties else (steps > 0.0).all():
-        return np.ones(len(time), dtype=bool)
-    place = bisect_right if ties else bisect_left
-    tails: list[float] = []  # of the subsequences of each length, in -time and from the end, the smallest last element
-    at: list[int] = []  # and its index
-    before = np.full(len(time), -1)
-    for i in range(len(time) - 1, -1, -1):
-        length = place(tails, -time[i])
-        before[i] = at[length - 1] if length else -1
-        if length == len(tails):
-            tails.append(-time[i])
-            at.append(i)
-        else:
-            tails[length], at[length] = -time[i], i
-    keep = np.zeros(len(time), dtype=bool)
-    i = at[-1]
-    while i >= 0:
-        keep[i] = True
-        i = before[i]
-    return keep
-
-
-def _common_origin(parts: Sequence[_Part]) -> Origin:
+def _common_origin(parts: Sequence[Part]) -> Origin:
     """The first time of all usable rows; plain seconds and absolute times do not mix."""
     relative = [part for part in parts if not part.instants.absolute]
     absolute = [part for part in parts if part.instants.absolute]
     if relative and absolute:
         raise DataError(
             f"{relative[0].table.file} counts plain seconds in {relative[0].layout.time!r}, but "
-            f"{absolute[0].table.file} has dates or absolute times in {absolute[0].layout.time!r}: how they fit together "
-            'is not known. Say in [columns] what the seconds count (clock_scale = "unix", "gps" or "tai"), or choose '
-            "a time column that both files have (time = ...)"
+            f"{absolute[0].table.file} has dates or absolute times in {absolute[0].layout.time!r}: how they fit "
+            'together is not known. Say in [columns] what the seconds count (clock_scale = "unix", "gps" or "tai"), or '
+            "choose a time column that both files have (time = ...)"
         )
     firsts = [
         part.instants.select(group.index).earliest() for part in parts for group in part.groups() if len(group.index)
@@ -348,7 +171,7 @@ def _common_origin(parts: Sequence[_Part]) -> Origin:
     return together.earliest()
 
 
-def _gather(parts: Sequence[_Part], origin: Origin, kind: str, log: ProblemLog, name: tuple[str, int]) -> dict:
+def _gather(parts: Sequence[Part], origin: Origin, kind: str, log: ProblemLog, name: tuple[str, int]) -> dict:
     """Fields of a `Rows` from the groups of one kind of all tables, merged in time order."""
     groups = [(i, part, getattr(part, kind)) for i, part in enumerate(parts) if getattr(part, kind) is not None]
     files = tuple(part.table.file for part in parts)
@@ -361,6 +184,7 @@ def _gather(parts: Sequence[_Part], origin: Origin, kind: str, log: ProblemLog, 
         "time": time[order],
         "file": np.concatenate([empty, *(np.full(len(group.index), i) for i, _, group in groups)])[order],
         "row": np.concatenate([empty, *(part.table.row[group.index] for _, part, group in groups)])[order],
+        "step": np.concatenate([np.empty(0), *(group.step for _, _, group in groups)])[order],
         name[0]: np.concatenate([np.empty((0, name[1])), *(group.values for _, _, group in groups)])[order],
     }
     if kind != "stars":  # two files may overlap; the one named first on the command line is believed
@@ -369,10 +193,12 @@ def _gather(parts: Sequence[_Part], origin: Origin, kind: str, log: ProblemLog, 
             row = rows["row"][repeated & (rows["file"] == i)]
             log.add(files[i], row, "time_repeated", "another file has a row at the same time", "dropped")
         rows = {key: column[~repeated] for key, column in rows.items()}
+    if kind != "gyro":
+        del rows["step"]
     return {**rows, "files": files}
 
 
-def _gyro_rows(parts: Sequence[_Part], origin: Origin, log: ProblemLog) -> GyroRows:
+def _gyro_rows(parts: Sequence[Part], origin: Origin, log: ProblemLog) -> GyroRows:
     kinds = {part.layout.gyro_is_increment: part.table.file for part in parts if part.gyro is not None}
     if len(kinds) > 1:
         raise DataError(f"{kinds[True]} has gyro increments, {kinds[False]} gyro rates; give files of one kind")
@@ -413,6 +239,6 @@ def _in_order(problems: Sequence[Problem], files: Sequence[str]) -> tuple[Proble
     return tuple(sorted(problems, key=lambda problem: (order.get(problem.file, len(order)), problem.row)))
 
 
-def _clock_in_words(parts: Sequence[_Part], origin: Origin) -> str:
+def _clock_in_words(parts: Sequence[Part], origin: Origin) -> str:
     columns = dict.fromkeys(f"{part.layout.time} ({part.layout.scale})" for part in parts)
     return f"seconds since {origin}, from {', '.join(columns)}"

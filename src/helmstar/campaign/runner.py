@@ -1,0 +1,221 @@
+"""Run a campaign: blocks over workers, progress with the time left, what is finished kept whatever happens."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from .. import __version__
+from ..errors import CampaignError, ConfigurationError
+from ..scenarios.experiment import Experiment
+from .engine import Engine
+from .store import Store
+
+PACKAGES = ("helmstar", "jax", "jaxlib", "numpy", "scipy", "xarray", "pandas", "plotly", "pydantic")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """dataset: all finished runs; summary: the object of `--json`; interrupted: Ctrl-C came before the last run."""
+
+    dataset: xr.Dataset
+    summary: dict[str, Any]
+    interrupted: bool
+
+
+def versions() -> dict[str, str]:
+    """Of Python, the machine and the packages that results depend on."""
+    out = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system()}
+    for package in PACKAGES:
+        try:
+            out[package] = version(package)
+        except PackageNotFoundError:
+            out[package] = "not installed"
+    return out | {"helmstar": __version__}
+
+
+def default_workers() -> int:
+    """One for each core this process may use."""
+    try:
+        return max(1, len(os.sched_getaffinity(0)))
+    except AttributeError:  # not on every system
+        return max(1, os.cpu_count() or 1)
+
+
+def choose(experiment: Experiment, wanted: Iterable[str] | None) -> list[str]:
+    """The wanted estimators in the experiment's order, all by default; ConfigurationError names an unknown one."""
+    known = list(experiment.estimators)
+    if wanted is None:
+        return known
+    wanted = list(dict.fromkeys(w.strip() for w in wanted if w.strip()))
+    unknown = [w for w in wanted if w not in known]
+    if unknown or not wanted:
+        what = ", ".join(map(repr, unknown)) or "none given"
+        raise ConfigurationError(f"--estimators: {what} is not allowed: must be of {', '.join(known)}")
+    return [k for k in known if k in wanted]
+
+
+def run_campaign(
+    experiment: Experiment,
+    *,
+    runs: int,
+    seed: int,
+    folder: Path,
+    specification: dict[str, Any],
+    configuration: str,
+    command: str,
+    estimators: Sequence[str] | None = None,
+    resume: bool = False,
+    workers: int | None = None,
+    progress: bool = True,
+) -> Outcome:
+    """All runs of a campaign, in `folder`.
+
+    specification: the validated keys (for the manifest); configuration: the same as TOML or JSON text for the report;
+    command: what reproduces it. Raises CampaignError or ConfigurationError; on Ctrl-C the outcome holds what is finished,
+    and KeyboardInterrupt is raised only when nothing is.
+    """
+    begin = time.perf_counter()
+    names = choose(experiment, estimators)
+    workers = default_workers() if workers is None else workers
+    relevant = {k: v for k, v in specification.items() if k not in ("runs", "title")}
+    manifest = {
+        "scenario": experiment.name,
+        "runs": runs,
+        "estimators": names,
+        "helmstar_version": __version__,
+        "specification": relevant,
+        "command": command,
+    }
+    store = Store(folder, manifest, resume)
+    needed = range(-(-runs // experiment.width))
+    todo = [i for i in needed if i not in set(store.finished())]
+    interrupted = False
+    engine = Engine(experiment, names)
+    with _Progress(progress) as bar:
+        try:
+            if todo:
+                task = bar.add(f"compiling {engine.programs} programs", engine.programs)
+                engine.compile(workers, lambda: bar.advance(task))
+                bar.finish(task)
+                interrupted = _compute(engine, store, todo, workers, bar, experiment.width, runs)
+        except KeyboardInterrupt:
+            interrupted = True
+    finished = [i for i in store.finished() if i in needed]
+    dataset = store.load(finished, runs)
+    if dataset is None:
+        raise KeyboardInterrupt if interrupted else CampaignError(f"{folder}: no block could be kept")
+    if not interrupted and dataset.sizes["run"] < runs:
+        raise CampaignError(f"{folder}: a finished block could not be read; --resume computes it again")
+    for key, (dims, values, attrs) in experiment.fixed().items():
+        dataset[key] = (dims, values, attrs)
+    dataset.attrs = {
+        "scenario": experiment.name,
+        "title": experiment.title,
+        "seed": seed,
+        "runs": dataset.sizes["run"],
+        "requested_runs": runs,
+        "command": command,
+        "configuration": configuration,
+        "versions": json.dumps(versions()),
+        "helmstar_version": __version__,
+    }
+    metrics = experiment.summarise(dataset)
+    wall = time.perf_counter() - begin
+    dataset.attrs["wall_s"] = wall
+    part = folder / "results.nc.part"
+    dataset.to_netcdf(part, engine="h5netcdf")
+    os.replace(part, folder / "results.nc")
+    summary = {
+        "scenario": experiment.name,
+        "seed": seed,
+        "runs": dataset.sizes["run"],
+        "wall_s": round(wall, 3),
+        "estimators": metrics,
+    }
+    return Outcome(dataset, summary, interrupted)
+
+
+def _compute(
+    engine: Engine, store: Store, todo: list[int], workers: int, bar: _Progress, width: int, runs: int
+) -> bool:
+    """Compute and keep the blocks; True when Ctrl-C cut it short (blocks under way are still kept)."""
+    steps_each = len(engine.names)
+    task = bar.add(f"{runs} runs", len(todo) * steps_each)
+    queue = list(todo)
+    pending: set[Future] = set()
+    interrupted = False
+    failure: BaseException | None = None
+
+    def job(index: int) -> None:
+        store.save(engine.compute(index, lambda: bar.advance(task)), engine.experiment)
+
+    with ThreadPoolExecutor(workers) as pool:
+        while queue or pending:
+            try:
+                while queue and len(pending) < workers and failure is None:
+                    pending.add(pool.submit(job, queue.pop(0)))
+                if not pending:
+                    break
+                done, pending = wait(pending, return_when=FIRST_COMPLETED)
+                for future in done:
+                    failure = failure or future.exception()
+            except KeyboardInterrupt:
+                interrupted, queue = True, []
+    if failure is not None:
+        kept = len(store.finished()) * width
+        raise CampaignError(f"a block failed: {failure}; {kept} runs are kept in {store.folder}") from failure
+    bar.finish(task)
+    return interrupted
+
+
+class _Progress:
+    """rich's progress bar on stderr, or silence."""
+
+    def __init__(self, on: bool):
+        self._bar: Any = None
+        if on:
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+            from rich.progress import TimeRemainingColumn
+
+            columns = (
+                TextColumn("{task.description:<24}"),
+                BarColumn(),
+                MofNCompleteColumn(),
+                TimeElapsedColumn(),
+                TextColumn("left"),
+                TimeRemainingColumn(),
+            )
+            self._bar = Progress(*columns, console=Console(file=sys.stderr))
+
+    def __enter__(self) -> _Progress:
+        if self._bar:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar:
+            self._bar.stop()
+
+    def add(self, what: str, total: int) -> Any:
+        return self._bar.add_task(what, total=total) if self._bar else None
+
+    def advance(self, task: Any) -> None:
+        if self._bar:
+            self._bar.advance(task)
+
+    def finish(self, task: Any) -> None:
+        if self._bar:
+            self._bar.update(task, completed=self._bar.tasks[task].total)

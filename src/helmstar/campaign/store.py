@@ -1,0 +1,138 @@
+"""A campaign's folder: manifest, finished blocks, and the one Dataset they make. NetCDF and JSON; nothing is pickled.
+
+    campaign.json      what was asked for; a resume must ask for the same
+    blocks/000000.nc   one finished block, written whole or not at all
+    results.nc         the Dataset of all finished runs
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from ..errors import CampaignError
+from ..scenarios.experiment import Experiment
+from .engine import Block
+
+
+def fingerprint(manifest: dict[str, Any]) -> str:
+    """Of everything that a run's bits depend on: the number of runs is not part of it."""
+    relevant = {k: manifest[k] for k in ("specification", "estimators", "helmstar_version")}
+    return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write whole or not at all."""
+    part = path.with_name(path.name + ".part")
+    part.write_text(text, encoding="utf-8")
+    os.replace(part, path)
+
+
+class Store:
+    """The folder of one campaign. Raises CampaignError where the folder cannot be used as asked."""
+
+    def __init__(self, folder: Path, manifest: dict[str, Any], resume: bool):
+        self.folder = folder
+        self.blocks = folder / "blocks"
+        self.manifest = manifest | {"fingerprint": fingerprint(manifest)}
+        path = folder / "campaign.json"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if resume:
+                self._check(path)
+            elif self.blocks.exists():
+                for old in self.blocks.glob("*.nc"):
+                    old.unlink()
+            self.blocks.mkdir(exist_ok=True)
+            write_atomically(path, json.dumps(self.manifest, indent=2))
+        except OSError as error:
+            raise CampaignError(f"--out {folder}: cannot write there: {error.strerror or error}") from error
+
+    def _check(self, path: Path) -> None:
+        if not path.exists():
+            raise CampaignError(f"--resume: {self.folder} holds no campaign; leave --resume out to start one")
+        try:
+            earlier = json.loads(path.read_text(encoding="utf-8"))
+            mark = earlier["fingerprint"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise CampaignError(f"--resume: {path} is damaged ({error}); leave --resume out to start anew") from error
+        if mark != self.manifest["fingerprint"]:
+            changed = _differences(earlier, self.manifest)
+            raise CampaignError(
+                f"--resume: {self.folder} holds another campaign, different in {changed}; "
+                "ask for the same one, or give another --out"
+            )
+
+    def finished(self) -> list[int]:
+        """Numbers of the blocks that are whole."""
+        return sorted(int(f.stem) for f in self.blocks.glob("*.nc") if f.stem.isdigit())
+
+    def save(self, block: Block, experiment: Experiment) -> None:
+        """Keep a finished block."""
+        ds = _dataset(block, experiment)
+        path = self.blocks / f"{block.index:06d}.nc"
+        part = path.with_suffix(".part")
+        ds.to_netcdf(part, engine="h5netcdf")
+        os.replace(part, path)
+
+    def load(self, indices: Iterable[int], runs: int) -> xr.Dataset | None:
+        """Blocks joined along run, cut to run numbers below `runs`; None when there is none.
+
+        A block that cannot be read is removed, so that a resume computes it again.
+        """
+        parts = []
+        for i in indices:
+            path = self.blocks / f"{i:06d}.nc"
+            try:
+                with xr.open_dataset(path, engine="h5netcdf") as ds:
+                    parts.append(ds.load())
+            except (OSError, ValueError, KeyError):
+                path.unlink(missing_ok=True)
+        if not parts:
+            return None
+        parts.sort(key=lambda d: int(d["run"][0]))
+        data = xr.concat([p.drop_vars("seconds") for p in parts], "run") if len(parts) > 1 else parts[0].drop_vars("seconds")
+        weight = np.mean([p["seconds"].values for p in parts], axis=0)
+        data["us_per_step"] = ("estimator", 1e6 * weight / (parts[0].sizes["run"] * parts[0].sizes["time"]))
+        return data.isel(run=np.flatnonzero(data["run"].values < runs))
+
+
+def _differences(earlier: dict[str, Any], now: dict[str, Any]) -> str:
+    def flat(d: Any, prefix: str = "") -> dict[str, Any]:
+        if not isinstance(d, dict):
+            return {prefix[:-1]: d}
+        return {k: v for key, value in d.items() for k, v in flat(value, f"{prefix}{key}.").items()}
+
+    keys = ("specification", "estimators", "helmstar_version")
+    a, b = ({k: v for key in keys for k, v in flat(d.get(key), f"{key}.").items()} for d in (earlier, now))
+    changed = [k.removeprefix("specification.") for k in sorted(a.keys() | b.keys()) if a.get(k) != b.get(k)]
+    return ", ".join(changed[:5]) or "its manifest"
+
+
+def _dataset(block: Block, experiment: Experiment) -> xr.Dataset:
+    names = list(block.arrays)
+    variables: dict[str, Any] = {
+        key: (
+            ("estimator", "run", "time", *v.dims),
+            np.stack([block.arrays[n][key] for n in names]),
+            dict(v.attrs),
+        )
+        for key, v in experiment.variables.items()
+    }
+    variables["seconds"] = ("estimator", np.array([block.seconds[n] for n in names]), {"units": "s"})
+    steps = len(experiment.time)
+    coords = {
+        "run": block.runs,
+        "time": ("time", experiment.time, {"units": "s", "long_name": "time after the start"}),
+        "update": ("time", np.arange(1, steps + 1), {"long_name": "number of the measurement, from 1"}),
+        "estimator": names,
+        "axis": ["x", "y", "z"],
+    }
+    return xr.Dataset(variables, coords)

@@ -1,0 +1,293 @@
+"""The experiment of Xu, Pei and Jiang (2020), assembled: truth, sensors and every estimator by name.
+
+Update k = 1.. is the k-th star measurement; errors are taken after it. One more star measurement at t = 0 is used by the
+`_tuned` estimators alone, for the Wahba fix they start from; the bound knows it too.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ..attitude import svd
+from ..backend import jax, jnp
+from ..core import Gaussian, Measurement, Model, no_gate, pytree
+from ..evaluate import recursive_bound
+from ..filters import (
+    ErrorStateKalmanFilter,
+    Spread,
+    StaticSolver,
+    UnscentedBelief,
+    UnscentedKalmanFilter,
+    run,
+    scaled,
+)
+from ..filters.static import turn_covariance
+from ..geometry import quaternion, so3_left, so3_right
+from ..geometry.retraction import Retraction, gibbs_left, quaternion_additive
+from ..models import rigid_body, xu2020
+from .experiment import Call, Variable
+from .xu2020_specification import Specification
+
+Array = jax.Array
+ARCSEC = np.pi / 180.0 / 3600.0
+SIGMA_FLOOR = 1e-10
+"""Smallest sigma (rad) that a tuned filter is told: a noiseless sensor would make its covariance singular."""
+
+
+@pytree
+class Setting:
+    """Data of the simulation: truth attitudes (steps + 1, 4), increments (steps, 3) rad, star directions (2, 3) in N,
+    sigmas in rad, start error in rad (negative: X0 = I), seed."""
+
+    q: Array
+    increment: Array
+    r_N: Array
+    star_sigma: Array
+    gyro_sigma: Array
+    start_error: Array
+    seed: Array
+
+
+@pytree
+class Data:
+    """Of one run: increments u (steps, 3), stars z (steps, 2, 3), start attitude, Wahba fix at t = 0 and its covariance in
+    B, and the truth q (steps, 4) and r_N that every run shares."""
+
+    u: Array
+    z: Array
+    start: Array
+    fix: Array
+    fix_cov: Array
+    q: Array
+    r_N: Array
+
+
+# Purposes of the random streams. A key is folded with run, then step, then purpose; a filter that draws numbers takes its
+# own purpose from FILTER on, so that adding one leaves the truth as it is.
+GYRO, STARS, START, FILTER = 0, 1, 2, 1000
+
+
+def _simulate_run(s: Setting, run_id: Array) -> Data:
+    key = jax.random.fold_in(jax.random.key(s.seed), run_id)
+    steps = s.increment.shape[0]
+
+    def draw(step: Array) -> tuple[Array, Array]:
+        k = jax.random.fold_in(key, step)
+        return (
+            jax.random.normal(jax.random.fold_in(k, GYRO), (3,)),
+            jax.random.normal(jax.random.fold_in(k, STARS), (2, 3)),
+        )
+
+    gyro, stars = jax.vmap(draw)(jnp.arange(steps + 1))
+    true_z = jax.vmap(lambda q: s.r_N @ quaternion.to_matrix(q).T)(s.q)
+    z = true_z + s.star_sigma * stars
+    axis = jax.random.normal(jax.random.fold_in(jax.random.fold_in(key, 0), START), (3,))
+    axis = axis / jnp.sqrt(jnp.sum(axis**2))
+    off = quaternion.multiply(s.q[0], quaternion.exp(s.start_error * axis))
+    start = jnp.where(s.start_error >= 0, off, quaternion.identity())
+    fix = svd(z[0], s.r_N, jnp.maximum(s.star_sigma, SIGMA_FLOOR))
+    return Data(
+        s.increment + s.gyro_sigma * gyro[1:], z[1:], start, fix.q_BN, fix.covariance, s.q[1:], s.r_N
+    )
+
+
+_SHARED = Data(0, 0, 0, 0, 0, None, None)  # which fields of Data have a run axis  # type: ignore[arg-type]
+
+
+@jax.jit
+def simulate(setting: Setting, run_ids: Array) -> Data:
+    """Data of the runs with these numbers; truth is the same for all and has no run axis."""
+    return jax.vmap(partial(_simulate_run, setting), out_axes=_SHARED)(run_ids)
+
+
+@pytree
+class Prior:
+    """Covariance P0 at the start attitude, or (from_fix) the Wahba fix with its own covariance; `spread` for a UKF."""
+
+    P0: Array
+    from_fix: Array
+    spread: Spread | None = None
+
+
+def error_in_N(retraction: Retraction, truth: Array, belief: Any) -> tuple[Array, Array, Array]:
+    """Error xi of X = X_hat exp(xi) (rad in N), its sigma per axis, and NEES by the filter's own retraction.
+
+    The additive quaternion's four numbers are projected to three: xi = 2 Xi(q)^T dq.
+    """
+    q, P = belief.mean, belief.cov
+    xi = so3_right.boxminus(truth, q)
+    if retraction is quaternion_additive:
+        G = 2.0 * quaternion.rate_matrix(q).T
+        P = G @ P @ G.T
+        own, P_N = xi, P
+    else:
+        own = retraction.boxminus(truth, q)
+        R = quaternion.to_matrix(q)
+        P_N = P if retraction is so3_right else R.T @ P @ R
+    # Solved without a LAPACK call; a covariance that is not positive gives NaN, which is what is recorded.
+    from ..geometry import small
+
+    white = small.matvec(small.invert_lower(small.cholesky(P)), own)
+    return xi, jnp.sqrt(jnp.diagonal(P_N)), jnp.sum(white**2)
+
+
+@partial(jax.jit, static_argnames=("filter",))
+def estimate(model: Model, prior: Prior, stars: Array, data: Data, *, filter: Any) -> dict[str, Array]:
+    """Track of one estimator over all runs of `data`. `stars` (2,) of bool says which stars it sees."""
+    retraction = filter.retraction
+    steps = data.q.shape[0]
+
+    def one(data: Data) -> dict[str, Array]:
+        fix_cov = turn_covariance(data.fix, data.fix_cov, retraction)
+        mean = jnp.where(prior.from_fix, data.fix, data.start)
+        cov = jnp.where(prior.from_fix, fix_cov, prior.P0)
+        belief: Any = Gaussian(mean, cov)
+        if prior.spread is not None:
+            belief = UnscentedBelief(mean, cov, prior.spread)
+        m = Measurement(
+            data.z, jnp.broadcast_to(data.r_N, (steps, 2, 3)), jnp.broadcast_to(stars, (steps, 2))
+        )
+
+        def keep(belief, predicted, infos):
+            return belief, infos[0].nis, infos[0].dof
+
+        _, _, (beliefs, nis, dof) = run(filter, model, belief, data.u, jnp.ones(steps), (m,), no_gate(8), keep=keep)
+        xi, sigma, nees = jax.vmap(partial(error_in_N, retraction))(data.q, beliefs)
+        return {"error_rad": xi, "sigma_rad": sigma, "nees": nees, "nis": nis, "nis_dof": dof}
+
+    return jax.vmap(one, in_axes=(_SHARED,))(data)
+
+
+VARIABLES = {
+    "error_rad": Variable(
+        ("axis",), "f8", {"long_name": "error xi, X = X_hat exp([xi x])", "units": "rad", "frame": "N", "side": "right"}
+    ),
+    "sigma_rad": Variable(("axis",), "f4", {"long_name": "1 sigma of the error by the filter", "units": "rad", "frame": "N"}),
+    "nees": Variable((), "f4", {"long_name": "normalised estimation error squared, 3 degrees of freedom", "units": "1"}),
+    "nis": Variable((), "f4", {"long_name": "normalised innovation squared", "units": "1"}),
+    "nis_dof": Variable((), "i2", {"long_name": "degrees of freedom of nis", "units": "1"}),
+}
+"""What is recorded of every run, update and estimator."""
+
+
+class Experiment:
+    """The scenario ready to run; see `helmstar.scenarios.experiment.Experiment`."""
+
+    variables = VARIABLES
+
+    def __init__(self, spec: Specification, name: str = "xu2020"):
+        self.spec = spec
+        self.name = name
+        self.title = spec.title
+        self.width = spec.width
+        self.time = np.arange(1, spec.updates + 1) * spec.step_s
+        self.star_sigma = spec.star.sigma_arcsec * ARCSEC
+        self.gyro_sigma = spec.gyro.sigma_rad_step
+        self.truth = truth_of(spec)
+        error = spec.start.error_deg
+        self.simulate = Call(
+            simulate,
+            (
+                Setting(
+                    q=jnp.asarray(self.truth.q),
+                    increment=jnp.asarray(self.truth.increment),
+                    r_N=jnp.asarray(spec.star.directions, dtype=float),
+                    star_sigma=jnp.asarray(self.star_sigma),
+                    gyro_sigma=jnp.asarray(self.gyro_sigma),
+                    start_error=jnp.asarray(-1.0 if error is None else np.deg2rad(error)),
+                    seed=jnp.asarray(spec.seed),
+                ),
+            ),
+        )
+        self.estimators = self._estimators()
+
+    def _estimators(self) -> dict[str, Call]:
+        t = self.spec.tuning
+        both, one = jnp.array([True, True]), jnp.array([True, False])
+        sigma = max(self.star_sigma, SIGMA_FLOOR)
+        q = self.gyro_sigma**2
+        spread = scaled(t.ukf_alpha, t.ukf_beta, t.ukf_kappa)
+
+        def call(filter: Any, model: Model, stars: Array, P0: Array, spread: Spread | None = None, fix: bool = False):
+            prior = Prior(P0, jnp.asarray(fix), spread)
+            return Call(estimate, (model, prior, stars), {"filter": filter})
+
+        right, left = ErrorStateKalmanFilter(so3_right), ErrorStateKalmanFilter(so3_left)
+        gibbs, additive = ErrorStateKalmanFilter(gibbs_left), ErrorStateKalmanFilter(quaternion_additive)
+        P3, P4 = t.p0 * jnp.eye(3), t.quaternion_p0 * jnp.eye(4)
+
+        def lie(retraction: Retraction, tuned: bool) -> Model:
+            return xu2020.lie_model(*((q, sigma) if tuned else (t.q_w, t.sigma_v)), retraction)
+
+        def quat(tuned: bool) -> Model:
+            return xu2020.quaternion_model(*((0.25 * q, sigma) if tuned else (t.quaternion_q, t.quaternion_sigma_v)))
+
+        out = {"lie_printed": call(right, xu2020.printed_model(t.q_w, t.sigma_v), both, P3)}
+        for tuned in (False, True):
+            end = "_tuned" if tuned else ""
+            out["lie" + end] = call(right, lie(so3_right, tuned), both, P3, fix=tuned)
+            out["lie_left" + end] = call(left, lie(so3_left, tuned), both, P3, fix=tuned)
+            out["mekf" + end] = call(gibbs, lie(gibbs_left, tuned), both, P3, fix=tuned)
+            out["quaternion_ekf" + end] = call(additive, quat(tuned), both, P4, fix=tuned)
+            out["quaternion_ekf_one_star" + end] = call(additive, quat(tuned), one, P4, fix=tuned)
+            out["ukf" + end] = call(
+                UnscentedKalmanFilter(so3_right), lie(so3_right, tuned), both, P3, spread=spread, fix=tuned
+            )
+            out["static_svd" + end] = call(StaticSolver(), lie(so3_left, tuned), both, P3, fix=tuned)
+        return out
+
+    def bound(self) -> np.ndarray:
+        """Cramer-Rao covariance (updates, 3, 3) of xi in N, rad^2, from the fix at t = 0 on; NaN without star noise."""
+        if self.star_sigma == 0.0:
+            return np.full((len(self.time), 3, 3), np.nan)
+        r = np.array(self.spec.star.directions)
+        J = (2.0 * np.eye(3) - r.T @ r) / self.star_sigma**2
+        A = np.array(jax.vmap(lambda u: quaternion.to_matrix(quaternion.exp(-u)))(jnp.asarray(self.truth.increment)))
+        return recursive_bound(A, self.gyro_sigma**2 * np.eye(3), J, np.linalg.inv(J))
+
+    def fixed(self) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]]:
+        """Truth and bound."""
+        sigma = np.sqrt(np.diagonal(self.bound(), axis1=1, axis2=2))
+        return {
+            "truth_q_bn": (("time", "quaternion"), self.truth.q[1:], {"long_name": "true attitude, l = X r", "units": "1"}),
+            "bound_rad": (
+                ("time", "axis"),
+                sigma,
+                {"long_name": "Cramer-Rao bound, 1 sigma", "units": "rad", "frame": "N"},
+            ),
+        }
+
+    def summarise(self, dataset: Any) -> dict[str, dict]:
+        """The metrics of `helmstar run xu2020 --json`."""
+        from .xu2020_results import summarise
+
+        return summarise(dataset)
+
+    def claims(self, dataset: Any, summary: dict) -> list:
+        """The paper's claims, judged."""
+        from .xu2020_results import claims
+
+        return claims(dataset, summary)
+
+
+def truth_of(spec: Specification) -> rigid_body.RigidBodyTruth:
+    """True attitudes at t = 0, step, ... by the printed law (8), with the rate of (36) or its solution of (9)."""
+    t = spec.truth
+    f = np.array(t.rate_frequency_rad_s)
+    a = t.rate_amplitude_rad_s
+
+    def rate(s: float) -> np.ndarray:
+        return a * np.cos(f * s)
+
+    time = np.arange(spec.updates + 1) * spec.step_s
+    from scipy.spatial.transform import Rotation
+
+    q0 = Rotation.from_matrix(np.array(t.attitude)).as_quat()
+    if t.rate == "prescribed":
+        return rigid_body.simulate(time, q0, "printed", rate=rate)
+    J = np.diag(t.inertia_kg_m2)
+    torque = rigid_body.torque_of(rate, lambda s: -a * f * np.sin(f * s), J)
+    return rigid_body.simulate(time, q0, "printed", inertia=J, torque=torque, rate0=rate(0.0))

@@ -1,0 +1,195 @@
+"""sensors.toml: what is known of a gyro and a star tracker, in a data sheet's units, and in SI as properties.
+
+    [gyro]
+    arw_deg_sqrt_h = 0.003        # angle random walk; or arw_arcsec_sqrt_s, arw_rad_sqrt_s
+    rrw_deg_h_sqrt_h = 0.01       # rate random walk; or rrw_arcsec_s_sqrt_s, rrw_rad_s_sqrt_s
+    [star]
+    sigma_cross_arcsec = 5.0      # with sigma_roll_arcsec about the boresight; or sigma_arcsec for all axes
+    sigma_roll_arcsec = 40.0
+    q_sb = [0.0, 0.7071068, 0.0, 0.7071068]   # R_SB, scalar last: v_S = R_SB v_B, boresight +z of S
+    [filter]
+    gate_probability = 1e-6
+    [columns]                     # foreign column names, see helmstar.io.columns
+
+1 deg/sqrt(h) = (pi/180) / 60 rad/sqrt(s); 1 deg/h/sqrt(h) = (pi/180) / 3600 / 60 rad/s/sqrt(s).
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from ..configuration import explain, read_toml
+from ..errors import ConfigurationError
+from ..io.columns import ColumnsConfiguration
+
+DEG = math.pi / 180.0
+ARCSEC = DEG / 3600.0
+HOUR_S = 3600.0
+
+ARW_UNITS = {"arw_arcsec_sqrt_s": ARCSEC, "arw_deg_sqrt_h": DEG / math.sqrt(HOUR_S), "arw_rad_sqrt_s": 1.0}
+RRW_UNITS = {
+    "rrw_arcsec_s_sqrt_s": ARCSEC,
+    "rrw_deg_h_sqrt_h": DEG / HOUR_S / math.sqrt(HOUR_S),
+    "rrw_rad_s_sqrt_s": 1.0,
+}
+BIAS_INSTABILITY_UNITS = {"bias_instability_arcsec_s": ARCSEC, "bias_instability_deg_h": DEG / HOUR_S}
+
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    def _one_of(self, units: dict[str, float]) -> float | None:
+        """The SI value of the one key of `units` that is given."""
+        given = [key for key in units if getattr(self, key) is not None]
+        return getattr(self, given[0]) * units[given[0]] if given else None
+
+    def _refuse_two(self, units: dict[str, float]) -> None:
+        given = [key for key in units if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} say the same thing in different units; keep one of them")
+
+
+class GyroConfiguration(_Table):
+    """`[gyro]`. What is absent is None: the noise then has to come from the data (`helmstar allan`)."""
+
+    arw_arcsec_sqrt_s: NotNegative | None = None
+    arw_deg_sqrt_h: NotNegative | None = None
+    arw_rad_sqrt_s: NotNegative | None = None
+    rrw_arcsec_s_sqrt_s: NotNegative | None = None
+    rrw_deg_h_sqrt_h: NotNegative | None = None
+    rrw_rad_s_sqrt_s: NotNegative | None = None
+    bias_instability_arcsec_s: NotNegative | None = Field(default=None, description="informative; no filter uses it")
+    bias_instability_deg_h: NotNegative | None = Field(default=None, description="informative; no filter uses it")
+    initial_drift_sigma_arcsec_s: Positive | None = None
+    reading: Literal["instant", "mean_since_previous", "increment_rad"] = "instant"
+    time_offset_s: Finite = Field(default=0.0, description="time of a sample = its stamp + this")
+
+    @model_validator(mode="after")
+    def _one_unit_each(self) -> GyroConfiguration:
+        for units in (ARW_UNITS, RRW_UNITS, BIAS_INSTABILITY_UNITS):
+            self._refuse_two(units)
+        return self
+
+    @property
+    def arw(self) -> float | None:
+        """Angle random walk in rad/sqrt(s): sigma of the angle after 1 s."""
+        return self._one_of(ARW_UNITS)
+
+    @property
+    def rrw(self) -> float | None:
+        """Rate random walk in rad/s/sqrt(s): sigma of the drift's change after 1 s."""
+        return self._one_of(RRW_UNITS)
+
+    @property
+    def bias_instability(self) -> float | None:
+        """Bias instability in rad/s."""
+        return self._one_of(BIAS_INSTABILITY_UNITS)
+
+    @property
+    def initial_drift_sigma(self) -> float | None:
+        """1 sigma of the drift at the start, rad/s per axis; None: from the first attitudes."""
+        sigma = self.initial_drift_sigma_arcsec_s
+        return None if sigma is None else sigma * ARCSEC
+
+
+class StarConfiguration(_Table):
+    """`[star]`: 1 sigma of a measured attitude, or of each direction where directions are measured."""
+
+    sigma_arcsec: Positive | None = None
+    sigma_cross_arcsec: Positive | None = Field(default=None, description="about x and y of S, across the boresight")
+    sigma_roll_arcsec: Positive | None = Field(default=None, description="about z of S, the boresight")
+    q_sb: Annotated[list[Finite], Field(min_length=4, max_length=4)] | None = None
+    time_offset_s: Finite = Field(default=0.0, description="time of a sample = its stamp + this")
+
+    @field_validator("q_sb")
+    @classmethod
+    def _unit(cls, q: list[float] | None) -> list[float] | None:
+        if q is not None and not abs(math.hypot(*q) - 1.0) <= 1e-3:
+            raise ValueError(f"{q} has length {math.hypot(*q):.6g}, but a rotation needs 1 (x, y, z, w; scalar last)")
+        return q
+
+    @model_validator(mode="after")
+    def _one_description(self) -> StarConfiguration:
+        across, roll = self.sigma_cross_arcsec is not None, self.sigma_roll_arcsec is not None
+        if across != roll:
+            given, lacking = ("cross", "roll") if across else ("roll", "cross")
+            raise ValueError(f"sigma_{given}_arcsec needs sigma_{lacking}_arcsec beside it")
+        if across and self.sigma_arcsec is not None:
+            raise ValueError("give either sigma_arcsec or sigma_cross_arcsec with sigma_roll_arcsec, not all of them")
+        return self
+
+    @property
+    def sigma_S(self) -> np.ndarray | None:
+        """1 sigma (3,) in rad about the axes of S: [cross, cross, roll]; None if not given."""
+        if self.sigma_arcsec is not None:
+            return np.full(3, self.sigma_arcsec * ARCSEC)
+        if self.sigma_cross_arcsec is None or self.sigma_roll_arcsec is None:
+            return None
+        return np.array([self.sigma_cross_arcsec, self.sigma_cross_arcsec, self.sigma_roll_arcsec]) * ARCSEC
+
+    @property
+    def R_SB(self) -> np.ndarray:
+        """Mounting (3, 3): v_S = R_SB v_B; identity if `q_sb` is not given."""
+        if self.q_sb is None:
+            return np.eye(3)
+        x, y, z, w = np.array(self.q_sb) / math.hypot(*self.q_sb)
+        return np.array(
+            [
+                [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+                [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+                [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+            ]
+        )
+
+    def covariance_B(self) -> np.ndarray | None:
+        """Covariance (3, 3) in rad^2 of a measured attitude's small rotation, in body axes; None if not given."""
+        sigma = self.sigma_S
+        return None if sigma is None else self.R_SB.T @ np.diag(sigma**2) @ self.R_SB
+
+
+class FilterConfiguration(_Table):
+    """`[filter]`."""
+
+    gate_probability: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = Field(
+        default=1e-6, description="a good measurement is refused this often; 0 refuses none"
+    )
+    reopen_after: Annotated[int, Field(ge=1)] = Field(
+        default=5, description="refusals in a row after which one is accepted"
+    )
+
+
+class SensorsConfiguration(_Table):
+    """All of sensors.toml. `columns` holds one map, or several with a `file` pattern each (`[[columns]]`)."""
+
+    columns: list[ColumnsConfiguration] = []
+    gyro: GyroConfiguration = GyroConfiguration()
+    star: StarConfiguration = StarConfiguration()
+    filter: FilterConfiguration = FilterConfiguration()
+
+    @field_validator("columns", mode="before")
+    @classmethod
+    def _one_or_several(cls, value: Any) -> Any:
+        return [value] if isinstance(value, dict) else value
+
+
+def load_sensors(path: Path | str | None) -> SensorsConfiguration:
+    """Read and check a sensors.toml; without one everything has its default."""
+    if path is None:
+        return SensorsConfiguration()
+    content = read_toml(path)
+    try:
+        return SensorsConfiguration.model_validate(content)
+    except ValidationError as error:
+        explained = explain(error, str(path), SensorsConfiguration)
+        if isinstance(content.get("columns"), dict):  # written as one table, so name its keys so
+            explained = ConfigurationError(str(explained).replace("columns[0]", "columns"))
+        raise explained from None
