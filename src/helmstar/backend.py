@@ -42,4 +42,7 @@ def _enable_compilation_cache() -> None:
 
 _enable_compilation_cache()
 
-__all__ = ["jax", "jnp"]
+COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
+"""For `lowered.compile(...)` and `jax.jit`: a third less compile time than XLA's default level at the same speed."""
+
+__all__ = ["COMPILER_OPTIONS", "jax", "jnp"]

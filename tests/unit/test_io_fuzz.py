@@ -19,10 +19,17 @@ HEADERS = [
     "time_gps_s gyro_x_rad gyro_y_rad gyro_z_rad q_bn_x q_bn_y q_bn_z q_bn_w",
     "time_s\tstar_b_x\tstar_b_y\tstar_b_z\tstar_n_x\tstar_n_y\tstar_n_z\tmode",
 ]
-CELLS = st.sampled_from(
-    ["", " ", "0", "1", "-1", "0.5", "1e-3", "nan", "inf", "-inf", "1e308", "1e999", "1e-320", "x", '"', '"1"', "#", "1,5",
-     "2016-12-31T23:59:60Z", "2016-02-30T00:00:00", "9999-12-31T23:59:59", "99999999999999999999", "\x00", "\ufffd", "é"]
-)  # fmt: skip
+CELLS = st.one_of(
+    st.sampled_from(
+        ["", " ", "0", "1", "-1", "0.5", "1e-3", "nan", "inf", "-inf", "1e308", "1e999", "1e-320", "9" * 20]
+    ),
+    st.sampled_from(["x", '"', '"1"', "#", "1,5", "\x00", "\ufffd", "é"]),
+    st.sampled_from(["2016-12-31T23:59:60Z", "2016-02-30T00:00:00", "9999-12-31T23:59:59"]),
+)
+
+
+def pointing_to(name, error):
+    assert name in str(error)
 
 
 def survive(file):
@@ -30,8 +37,7 @@ def survive(file):
     try:
         telemetry = read_telemetry([file], needs=[])
     except HelmstarError as error:
-        assert file.name in str(error)
-        return None
+        return pointing_to(file.name, error)
     for reading in ("instant", "mean_since_previous", "increment_rad"):
         screen_gyro(telemetry.gyro, telemetry.attitude, reading)
     find_gaps(telemetry.gyro.time)
@@ -142,4 +148,4 @@ def test_arbitrary_configuration(tmp_path, content):
     try:
         load_sensors(tmp_path / "sensors.toml")
     except HelmstarError as error:
-        assert "sensors.toml" in str(error)
+        pointing_to("sensors.toml", error)

@@ -204,8 +204,9 @@ def test_base_rates_are_turned_by_interpolated_attitudes_and_never_extrapolated(
     data[GYRO] = R_BN.inv().apply(data[GYRO].to_numpy())
     attitude = data[["time_s", *QUATERNION]].iloc[10:191:20]
     telemetry = read(tmp_path, data[["time_s", *GYRO]], attitude, columns=ColumnsConfiguration(gyro_frame="base"))
-    np.testing.assert_allclose(telemetry.gyro.value, motion(201, dt=0.05)[GYRO][10:191], atol=1e-7)
-    assert np.abs(R_BN[100].apply(data[GYRO].to_numpy()[100]) - telemetry.gyro.value[90]).max() < 1e-7
+    body = motion(201, dt=0.05)[GYRO].to_numpy()[10:191]
+    np.testing.assert_allclose(telemetry.gyro.value, body, atol=2e-6)  # the rate changes within the second between
+    np.testing.assert_allclose(telemetry.gyro.value[::20], body[::20], atol=1e-15)
     assert {(p.kind, p.action) for p in telemetry.problems} == {("frame", "dropped")}
     assert [p.row for p in telemetry.problems] == [*range(2, 12), *range(193, 203)]
 
@@ -247,8 +248,10 @@ def test_utc_and_gps_tables_fit_together(tmp_path):
 
 def test_relative_and_absolute_times_do_not_mix(tmp_path):
     data = motion(4)
-    with pytest.raises(DataError, match=r"plain seconds .* clock_scale"):
-        read(tmp_path, data[["time_s", *GYRO]], data[["time_s", *QUATERNION]].rename(columns={"time_s": "time_unix_s"}))
+    unix = data[["time_s", *QUATERNION]].rename(columns={"time_s": "time_unix_s"})
+    unix["time_unix_s"] += 1.4e9
+    with pytest.raises(DataError, match=r"(?s)plain seconds .*not known.*clock_scale"):
+        read(tmp_path, data[["time_s", *GYRO]], unix)
 
 
 @pytest.mark.parametrize(
@@ -256,7 +259,7 @@ def test_relative_and_absolute_times_do_not_mix(tmp_path):
     [
         ("a,b\n1,2\n", None, ["Columns found: a, b", "gyro_x_rad_s", "q_bn_w", "[columns]"]),
         ("time_s,gyro_x_rad_s,gyro_y_rad_s,gyro_zz_rad_s\n1,2,3,4\n", None, ["gyro_z_rad_s", "'gyro_zz_rad_s'"]),
-        ("t,wx,wy,wz\n1,2,3,4\n", {"time": "t", "gyro": ["wx", "wy", "vz"]}, ["vz", "did you mean 'wz'"]),
+        ("t,w_x,w_y,w_z\n1,2,3,4\n", {"time": "t", "gyro": ["w_x", "w_y", "v_z"]}, ["v_z", "did you mean 'w_z'"]),
         ("t,wx,wy,wz\n1,2,3,4\n", {"time": "tt", "gyro": ["wx", "wy", "wz"]}, ["no time", "tt"]),
         ("time_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s\nx,2,3,4\n", None, ["'x'", "clock_scale"]),
         ("time_utc,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s\n1e9,2,3,4\n", None, ["POSIX", 'clock_scale = "unix"']),

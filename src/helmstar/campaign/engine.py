@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..backend import jax, jnp
+from ..backend import COMPILER_OPTIONS, jax, jnp
 from ..scenarios.experiment import Call, Experiment
 
 
@@ -64,7 +64,7 @@ class Engine:
 
         def job(key: Any) -> tuple[Any, Any]:
             call, data = self._jobs[key]
-            return key, call.function.lower(*call.arguments, data, **call.static).compile()
+            return key, call.function.lower(*call.arguments, data, **call.static).compile(COMPILER_OPTIONS)
 
         with ThreadPoolExecutor(workers) as pool:
             for future in as_completed([pool.submit(job, key) for key in self._jobs if key not in self._programs]):

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import platform
-import sys
 import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +15,11 @@ import xarray as xr
 
 from .. import __version__
 from ..errors import CampaignError, ConfigurationError
+from ..progress import Progress
 from ..scenarios.experiment import Experiment
+from ..versions import versions
 from .engine import Engine
 from .store import Store
-
-PACKAGES = ("helmstar", "jax", "jaxlib", "numpy", "scipy", "xarray", "pandas", "plotly", "pydantic")
-
 
 @dataclass(frozen=True)
 class Outcome:
@@ -32,17 +28,6 @@ class Outcome:
     dataset: xr.Dataset
     summary: dict[str, Any]
     interrupted: bool
-
-
-def versions() -> dict[str, str]:
-    """Of Python, the machine and the packages that results depend on."""
-    out = {"python": platform.python_version(), "machine": platform.machine(), "system": platform.system()}
-    for package in PACKAGES:
-        try:
-            out[package] = version(package)
-        except PackageNotFoundError:
-            out[package] = "not installed"
-    return out | {"helmstar": __version__}
 
 
 def default_workers() -> int:
@@ -103,7 +88,7 @@ def run_campaign(
     todo = [i for i in needed if i not in set(store.finished())]
     interrupted = False
     engine = Engine(experiment, names)
-    with _Progress(progress) as bar:
+    with Progress(progress) as bar:
         try:
             if todo:
                 task = bar.add(f"compiling {engine.programs} programs", engine.programs)
@@ -148,7 +133,7 @@ def run_campaign(
 
 
 def _compute(
-    engine: Engine, store: Store, todo: list[int], workers: int, bar: _Progress, width: int, runs: int
+    engine: Engine, store: Store, todo: list[int], workers: int, bar: Progress, width: int, runs: int
 ) -> bool:
     """Compute and keep the blocks; True when Ctrl-C cut it short (blocks under way are still kept)."""
     steps_each = len(engine.names)
@@ -178,44 +163,3 @@ def _compute(
         raise CampaignError(f"a block failed: {failure}; {kept} runs are kept in {store.folder}") from failure
     bar.finish(task)
     return interrupted
-
-
-class _Progress:
-    """rich's progress bar on stderr, or silence."""
-
-    def __init__(self, on: bool):
-        self._bar: Any = None
-        if on:
-            from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-            from rich.progress import TimeRemainingColumn
-
-            columns = (
-                TextColumn("{task.description:<24}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeElapsedColumn(),
-                TextColumn("left"),
-                TimeRemainingColumn(),
-            )
-            self._bar = Progress(*columns, console=Console(file=sys.stderr))
-
-    def __enter__(self) -> _Progress:
-        if self._bar:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar:
-            self._bar.stop()
-
-    def add(self, what: str, total: int) -> Any:
-        return self._bar.add_task(what, total=total) if self._bar else None
-
-    def advance(self, task: Any) -> None:
-        if self._bar:
-            self._bar.advance(task)
-
-    def finish(self, task: Any) -> None:
-        if self._bar:
-            self._bar.update(task, completed=self._bar.tasks[task].total)

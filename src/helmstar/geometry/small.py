@@ -20,6 +20,7 @@ def symmetrise(P: Array) -> Array:
     return 0.5 * (P + transpose(P))
 
 
+@jax.jit
 def cholesky(A: Array) -> Array:
     """Lower L with L L^T = A for symmetric positive definite A (..., n, n); NaN where A is not positive definite.
 
@@ -44,6 +45,7 @@ def cholesky(A: Array) -> Array:
     return jnp.stack(full, axis=-1).reshape(A.shape)
 
 
+@jax.jit
 def solve_lower(L: Array, B: Array) -> Array:
     """L^-1 B for lower triangular L (..., n, n) and B (..., n, m)."""
     n = L.shape[-1]
@@ -56,6 +58,7 @@ def solve_lower(L: Array, B: Array) -> Array:
     return jnp.stack(rows, axis=-2)
 
 
+@jax.jit
 def solve_upper_of_lower(L: Array, B: Array) -> Array:
     """L^-T B for lower triangular L (..., n, n) and B (..., n, m)."""
     n = L.shape[-1]
@@ -68,6 +71,7 @@ def solve_upper_of_lower(L: Array, B: Array) -> Array:
     return jnp.stack(rows, axis=-2)
 
 
+@jax.jit
 def invert_lower(L: Array) -> Array:
     """L^-1 for lower triangular L (..., n, n)."""
     n = L.shape[-1]
@@ -99,16 +103,19 @@ def inverse_spd(A: Array) -> Array:
     return transpose(V) @ V
 
 
+@jax.jit
 def matmul(A: Array, B: Array) -> Array:
     """A B as a sum of outer products: on a CPU several times faster than a batched `@` for sizes up to some 12."""
     return sum((A[..., :, k, None] * B[..., k, None, :] for k in range(1, A.shape[-1])), A[..., :, 0, None] * B[..., 0, None, :])
 
 
+@jax.jit
 def matvec(A: Array, v: Array) -> Array:
     """A v."""
     return jnp.sum(A * v[..., None, :], axis=-1)
 
 
+@jax.jit
 def congruence(A: Array, P: Array) -> Array:
     """A P A^T."""
     return matmul(matmul(A, P), transpose(A))

@@ -22,6 +22,7 @@ from .series import cos_of_square, jacobian_inverse_coefficient, sinc_of_square,
 Array = jax.Array
 
 
+@jax.jit
 def hat(v: Array) -> Array:
     """Cross-product matrix: `hat(v) @ u == cross(v, u)`. Shape (..., 3) -> (..., 3, 3)."""
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
@@ -43,6 +44,7 @@ def _polynomial(phi: Array, a: Array | float, b: Array | float, c: Array | float
     return a * jnp.eye(3, dtype=phi.dtype) + b * hat(phi) + c * outer
 
 
+@jax.jit
 def exp(phi: Array) -> Array:
     """R = exp([phi x]), Rodrigues' formula: cos t I + (sin t / t) [phi x] + ((1 - cos t) / t^2) phi phi^T."""
     t2 = jnp.sum(phi * phi, axis=-1)
@@ -54,6 +56,7 @@ def log(R: Array) -> Array:
     return quaternion.log(quaternion.from_matrix(R))
 
 
+@jax.jit
 def left_jacobian(phi: Array) -> Array:
     """J_l(phi) = (sin t / t) I + ((1 - cos t) / t^2) [phi x] + ((t - sin t) / t^3) phi phi^T."""
     t2 = jnp.sum(phi * phi, axis=-1)
@@ -65,6 +68,7 @@ def right_jacobian(phi: Array) -> Array:
     return left_jacobian(-phi)
 
 
+@jax.jit
 def left_jacobian_inverse(phi: Array) -> Array:
     """J_l(phi)^-1 = (1 - t^2 c) I - [phi x] / 2 + c phi phi^T, c = (1 - (t/2) cot(t/2)) / t^2; singular at 2 pi only."""
     t2 = jnp.sum(phi * phi, axis=-1)

@@ -16,6 +16,8 @@ from .table import Table
 
 NORM_TOLERANCE = 1e-3  # a quaternion or direction farther from length 1 is damaged, not rounded
 ROUNDING = 1e-6  # a norm this close to 1 is the rounding of printed digits, not worth a word
+LARGEST = 1e12  # no rate, quaternion or direction is larger in any unit; sums of squares stay finite
+SAME_TIME_S = 1e-9
 NAN_IS_ABSENT = 0.1  # a table with more rows than this without one of its measurements writes NaN for "none"
 
 
@@ -146,10 +148,10 @@ def _cells(
     text = "{} holds something that is no number".format
     log.add(table.file, table.row[not_numbers], "not_a_number", lambda i: text(blamed[i]), "dropped")
 
-    not_finite = ~np.isfinite(values)
+    not_finite = ~(np.abs(values) <= LARGEST)
     undefined = timed & ~absent & ~not_numbers & not_finite.any(axis=1)
     blamed_undefined = first(not_finite, undefined)
-    what = np.where(empty[undefined].any(axis=1), "empty", "NaN or infinite")
+    what = np.where(empty[undefined].any(axis=1), "empty", "NaN, infinite or beyond 1e12")
     log.add(table.file, table.row[undefined], "nan", lambda i: f"{blamed_undefined[i]} is {what[i]}", "dropped")
     return values, timed & ~absent & ~not_numbers & ~undefined, absent
 
@@ -218,7 +220,7 @@ def _once_per_time(
 ) -> np.ndarray:
     """Of rows with equal time the first. Beside `stars`, one per row, copies of the same values are no fault."""
     here, before = index[1:], index[:-1]
-    repeated = (instants.day[here] == instants.day[before]) & (instants.second[here] == instants.second[before])
+    repeated = np.diff(instants.select(index).seconds()) < SAME_TIME_S
     faults = repeated & ~(values[here] == values[before]).all(axis=1) if stars else repeated
     message = "the time is that of the row before"
     log.add(table.file, table.row[here[faults]], "time_repeated", message, "dropped")

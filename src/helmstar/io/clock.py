@@ -29,7 +29,7 @@ DAY_S = 86400.0
 TAI_MINUS_GPS_S = 19.0
 _JD_2000 = 2451544.5  # Julian date of 2000-01-01T00:00, where the days of `Instants` begin
 _EPOCH_2000 = np.datetime64("2000-01-01", "D")
-_FARTHEST_S = 1e11  # 3000 years; beyond it a number is no time of telemetry
+_FARTHEST_DATE_S = 1e11  # 3000 years: beyond it a number is no time of telemetry
 
 _ISO = (
     r"^(?P<year>\d{4})-(?:(?P<month>\d\d)-(?P<day>\d\d)|(?P<doy>\d{3}))[T ]"
@@ -101,7 +101,7 @@ class Instants:
 
 def from_numbers(value: np.ndarray, scale: Scale) -> tuple[Instants, np.ndarray]:
     """Times from seconds in a scale other than utc, and which of them are times at all (the rest are set to 0)."""
-    good = np.isfinite(value) & (np.abs(value) < (np.inf if scale == "s" else _FARTHEST_S))
+    good = np.isfinite(value) & (np.abs(value) < (1e15 if scale == "s" else _FARTHEST_DATE_S))
     value = np.where(good, value, 0.0)
     if scale == "s":
         return Instants(np.zeros(len(value), dtype=np.int64), value, absolute=False), good

@@ -154,13 +154,19 @@ def _rows_in_wrong_unit(gyro: GyroRows, attitude: AttitudeRows, reading: Reading
         return bad, "unit", message  # no such step, or no two levels: then it is something else
     high = level == level.max()
     fewer, more = sorted(((high, 1.0 / DEG, "57.3"), (~high, DEG, "1/57.3")), key=lambda side: side[0].sum())
-    for rows, factor, times in (fewer, more):
-        mended = np.where(rows[:, None], gyro.value * factor, gyro.value)
-        as_is, as_mended = (np.median(misfit) for misfit in _misfits(gyro, attitude, reading, rows, mended))
-        inside = rows is fewer[0] and not rows[0] and not rows[-1]
+    mended = [np.where(rows[:, None], gyro.value * factor, gyro.value) for rows, factor, _ in (fewer, more)]
+    for i, (rows, _, times) in enumerate((fewer, more)):
+        misfits = _misfits(gyro, attitude, reading, rows, [gyro.value, *mended])
+        as_is, as_mended = _known_median(misfits[0]), _known_median(misfits[1 + i])
+        inside = i == 0 and not rows[0] and not rows[-1]
         if as_mended < 0.5 * as_is or (inside and not as_is < 0.5 * as_mended):
             return rows, "unit", message.format(times)
     return bad, "unit", message
+
+
+def _known_median(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else math.nan
 
 
 def _unit_steps(time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -203,7 +209,7 @@ def _spikes(gyro: GyroRows, attitude: AttitudeRows, reading: Reading) -> tuple[n
     mended = gyro.value.copy()
     for axis in range(3):
         mended[bad, axis] = np.interp(gyro.time[bad], gyro.time[~bad], gyro.value[~bad, axis])
-    as_is, as_mended = _misfits(gyro, attitude, reading, bad, mended)
+    as_is, as_mended = _misfits(gyro, attitude, reading, bad, [rate, mended])
     bad[np.flatnonzero(bad)[as_is < 0.5 * as_mended]] = False
     return bad, "jump", message
 
@@ -221,31 +227,42 @@ def _sigma(off: np.ndarray) -> np.ndarray:
 
 
 def _resolution(rate: np.ndarray) -> np.ndarray:
-    """The smallest difference between values per axis: the quantum of quantised data, next to nothing otherwise."""
-    smallest = [np.diff(np.unique(rate[:, axis])) for axis in range(3)]
-    return np.array([steps.min() if len(steps) > 1 else 0.0 for steps in smallest])
+    """The smallest difference between values that recur, per axis: the quantum of quantised data, else 0 or near it."""
+    smallest = []
+    for axis in range(3):
+        values, count = np.unique(rate[:, axis], return_counts=True)
+        smallest.append(np.min(np.diff(values[count > 1]), initial=np.inf))
+    return np.where(np.isfinite(smallest), smallest, 0.0)
 
 
 # ----------------------------------------------------------------------------- what the attitudes say
 
 
 def _misfits(
-    gyro: GyroRows, attitude: AttitudeRows, reading: Reading, rows: np.ndarray, mended: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """For each of the suspected `rows` (a mask), rad: how far the turn between the attitudes around it is from the
-    integrated rates as they are, and from the rates `mended` (n, 3), drift removed. NaN where no attitudes are around.
+    gyro: GyroRows, attitude: AttitudeRows, reading: Reading, rows: np.ndarray, candidates: list[np.ndarray]
+) -> list[np.ndarray]:
+    """For each of the suspected `rows` (a mask), rad: how far the integral of each candidate for all rates (n, 3) is
+    from the turn between the attitudes around the row; NaN where there are none. Drift is that of the best candidate.
     """
     after = np.searchsorted(attitude.time, gyro.time[rows], side="right")
-    as_is, as_mended = np.full(len(after), np.nan), np.full(len(after), np.nan)
     around = np.flatnonzero((after > 0) & (after < len(attitude)))
     # A rate acts on the steps before and after its row, so one attitude more on either side is taken.
     first, last = np.maximum(after[around] - 2, 0), np.minimum(after[around] + 1, len(attitude) - 1)
     start, end = attitude.time[first], attitude.time[last]
     turn = _turn(attitude.q_BN[first], attitude.q_BN[last])
     known = (start >= gyro.time[0]) & (end <= gyro.time[-1]) & (np.linalg.norm(turn, axis=1) < 1.0)
-    for value, misfit in ((gyro.value, as_is), (mended, as_mended)):
+
+    drifts = []
+    for value in candidates:
         by_attitude, by_gyro = _mean_rates(replace(gyro, value=value), attitude, reading)
         drift = np.median(by_attitude - by_gyro, axis=0) if len(by_gyro) else np.zeros(3)
+        left = np.median(np.linalg.norm(by_attitude - by_gyro - drift, axis=1)) if len(by_gyro) else 0.0
+        drifts.append((left, drift))
+    drift = min(drifts, key=lambda pair: pair[0])[1]
+    misfits = []
+    for value in candidates:
         integral = _integral(gyro.time, value + drift, reading, start[known], end[known])
+        misfit = np.full(len(after), np.nan)
         misfit[around[known]] = np.linalg.norm(turn[known] - integral, axis=1)
-    return as_is, as_mended
+        misfits.append(misfit)
+    return misfits

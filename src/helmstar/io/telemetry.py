@@ -14,7 +14,7 @@ from typing import Literal, Self
 import numpy as np
 
 from ..errors import DataError
-from .cleaning import Part, clean
+from .cleaning import SAME_TIME_S, Part, clean
 from .clock import Instants, Origin
 from .columns import ColumnsConfiguration
 from .problems import Problem, ProblemLog, refuse
@@ -188,7 +188,7 @@ def _gather(parts: Sequence[Part], origin: Origin, kind: str, log: ProblemLog, n
         name[0]: np.concatenate([np.empty((0, name[1])), *(group.values for _, _, group in groups)])[order],
     }
     if kind != "stars":  # two files may overlap; the one named first on the command line is believed
-        repeated = np.concatenate([[False], np.diff(rows["time"]) == 0.0]).astype(bool)[: len(time)]
+        repeated = np.concatenate([[False], np.diff(rows["time"]) < SAME_TIME_S]).astype(bool)[: len(time)]
         for i in np.unique(rows["file"][repeated]):
             row = rows["row"][repeated & (rows["file"] == i)]
             log.add(files[i], row, "time_repeated", "another file has a row at the same time", "dropped")

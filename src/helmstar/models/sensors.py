@@ -83,3 +83,34 @@ def _whole_left(params: None, x: Any, a: Array) -> Array:
 def whole_attitude(retraction: Retraction = so3_left) -> Sensor:
     """A measured q_BN whose error, on the left in B, has the covariance given as context (3, 3), rad^2."""
     return Sensor(_whole_predict, _whole_minus, _whole_cov, None, _whole_left if retraction is so3_left else None)
+
+
+def tangent_basis(b: Array) -> Array:
+    """Two unit vectors (..., 3, 2) across each unit vector b (..., 3)."""
+    x, y, z = b[..., 0], b[..., 1], b[..., 2]
+    s = jnp.where(z < 0.0, -1.0, 1.0)
+    a = -1.0 / (s + z)
+    c = x * y * a
+    first = jnp.stack([1.0 + s * x * x * a, s * c, -s * x], axis=-1)
+    second = jnp.stack([c, s + y * y * a, -y], axis=-1)
+    return jnp.stack([first, second], axis=-1)
+
+
+def _unit_minus(z: Array, z_hat: Array) -> Array:
+    return jnp.einsum("nij,ni->nj", tangent_basis(z_hat), z - z_hat).reshape(-1)
+
+
+def _unit_cov(params: StarNoise, x: Any, r_N: Array) -> Array:
+    return params.sigma**2 * jnp.eye(r_N.shape[0] * 2)
+
+
+def _unit_left(params: StarNoise, x: Any, r_N: Array) -> Array:
+    b = _stars_predict(params, x, r_N)
+    H = -jnp.einsum("nij,nik->njk", tangent_basis(b), so3.hat(b))
+    return _pad(H.reshape(-1, 3), x)
+
+
+def unit_star_directions(sigma: Array | float, retraction: Retraction = so3_left) -> Sensor:
+    """As `star_directions`, for measured directions of unit length: two residuals for each star, across its direction."""
+    jacobian = _unit_left if retraction in (so3_left, gibbs_left) else None
+    return Sensor(_stars_predict, _unit_minus, _unit_cov, StarNoise(jnp.asarray(sigma)), jacobian)

@@ -20,7 +20,7 @@ _KINDS: dict[str, ChipKind] = {
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim of a paper: what it says and where, what the printed equations and the consistent form give, the bound."""
+    """A paper's claim: what it says and where, what the printed and the consistent equations give, the bound."""
 
     claim: str
     source: str

@@ -1,4 +1,4 @@
-"""Figures as compact JSON: every large array once, as base64 of little-endian floats; NaN and infinity never reach JSON.
+"""Figures as compact JSON: every large array once, as base64 of little-endian floats; no NaN reaches the JSON.
 
 A figure is a plain dict of plotly's public figure JSON that may hold numpy arrays. `pack` replaces each large array by
 `{"$array": i}` into an `ArrayPool`, in which equal arrays (a shared time axis, say) are stored once; page.js turns them
@@ -82,16 +82,23 @@ def spread(count: int, most: int, dense_start: int = 100) -> np.ndarray:
     return np.unique(np.concatenate([np.arange(start), np.round(rest).astype(int)]))
 
 
-def extremes(values: np.ndarray, most: int) -> np.ndarray:
-    """At most `most` indices into a noisy series that keep its smallest and largest value in each of `most` / 2 stretches.
+def sample(values: np.ndarray, most: int) -> np.ndarray:
+    """At most `most` indices for a cloud of points: evenly spread, so that its density is true, and its outliers."""
+    if len(values) <= most:
+        return np.arange(len(values))
+    return np.union1d(spread(len(values), 3 * most // 4, 0), extremes(values, most // 4))
 
-    `values` is (n,), or (series, n) where one choice of indices must serve several series: then `most` holds for each.
+
+def extremes(values: np.ndarray, most: int) -> np.ndarray:
+    """At most `most` indices into a noisy series that keep the smallest and largest value of each stretch of it.
+
+    `values` is (n,), or (series, n) where one choice of indices must serve several series.
     """
     series = np.atleast_2d(values)
     count = series.shape[1]
     if count <= most:
         return np.arange(count)
-    stretches = max(most // 2 - 1, 1)
+    stretches = max((most - 2) // (2 * len(series)), 1)
     width = -(-count // stretches)
     padded = np.full((series.shape[0], stretches * width), np.nan)
     padded[:, :count] = np.where(np.isfinite(series), series, np.nan)

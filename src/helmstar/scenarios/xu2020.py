@@ -74,17 +74,15 @@ def _simulate_run(s: Setting, run_id: Array) -> Data:
     key = jax.random.fold_in(jax.random.key(s.seed), run_id)
     steps = s.increment.shape[0]
 
-    def draw(step: Array) -> tuple[Array, Array]:
-        k = jax.random.fold_in(key, step)
-        return (
-            jax.random.normal(jax.random.fold_in(k, GYRO), (3,)),
-            jax.random.normal(jax.random.fold_in(k, STARS), (2, 3)),
-        )
+    def draw(step: Array, purpose: Array) -> Array:
+        return jax.random.normal(jax.random.fold_in(jax.random.fold_in(key, step), purpose), (6,))
 
-    gyro, stars = jax.vmap(draw)(jnp.arange(steps + 1))
+    # One traced draw for all purposes: a random generator is slow to compile.
+    purposes = jnp.array([GYRO, STARS, START])
+    w = jax.vmap(lambda k: jax.vmap(lambda p: draw(k, p))(purposes))(jnp.arange(steps + 1))
+    gyro, stars, axis = w[:, 0, :3], w[:, 1].reshape(-1, 2, 3), w[0, 2, :3]
     true_z = jax.vmap(lambda q: s.r_N @ quaternion.to_matrix(q).T)(s.q)
     z = true_z + s.star_sigma * stars
-    axis = jax.random.normal(jax.random.fold_in(jax.random.fold_in(key, 0), START), (3,))
     axis = axis / jnp.sqrt(jnp.sum(axis**2))
     off = quaternion.multiply(s.q[0], quaternion.exp(s.start_error * axis))
     start = jnp.where(s.start_error >= 0, off, quaternion.identity())

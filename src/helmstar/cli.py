@@ -1,0 +1,282 @@
+"""The command line: parse, call, print. Everything heavy is imported by the command that needs it.
+
+With `--json` stdout is one object of finite numbers and nulls; progress and messages go to stderr, and the last line of
+stderr states an error. Exit codes: 0 done, 1 an error that the message explains, 2 wrong usage, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from . import __version__
+from .errors import HelmstarError
+
+EPILOG = """examples:
+  helmstar scenarios                                  what can be run
+  helmstar run xu2020                                 the full Monte Carlo campaign and its report
+  helmstar run xu2020 --runs 20 --estimators lie,mekf --set star.sigma_arcsec=5
+  helmstar attitude gyro.csv stars.csv --config sensors.toml
+  helmstar allan gyro.csv                             noise of a gyro, ready for sensors.toml
+
+Every command has --help with an example. Documentation: README.md and docs/."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    raw = argparse.RawDescriptionHelpFormatter
+    p = argparse.ArgumentParser(
+        prog="helmstar",
+        description="Spacecraft attitude from stars and gyros: simulate, estimate, and prove how well.",
+        epilog=EPILOG,
+        formatter_class=raw,
+    )
+    p.add_argument("--version", action="version", version=f"helmstar {__version__}")
+    sub = p.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    c = sub.add_parser(
+        "run",
+        help="run a scenario's Monte Carlo campaign and write its report",
+        description="Run a scenario's Monte Carlo campaign: results.nc, summary.json and report.html in the output folder.",
+        epilog="""examples:
+  helmstar run xu2020
+  helmstar run xu2020 --runs 20 --seed 7 --estimators lie,lie_tuned --out here
+  helmstar run xu2020 --set star.sigma_arcsec=5 --set gyro.sigma_rad_step=3e-6 --json
+  helmstar run mine.toml --resume                     go on after Ctrl-C""",
+        formatter_class=raw,
+    )
+    c.add_argument("scenario", help="a name from `helmstar scenarios`, or a .toml file of your own")
+    c.add_argument("--runs", type=int, metavar="N", help="number of Monte Carlo runs (default: the scenario's)")
+    c.add_argument("--seed", type=int, metavar="S", help="seed of all random streams (default: the scenario's)")
+    c.add_argument("--estimators", metavar="A,B", help="only these estimators (default: all)")
+    c.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="override any key of the scenario; repeatable"
+    )
+    c.add_argument("--workers", type=int, metavar="W", help="blocks of runs computed side by side (default: cores)")
+    c.add_argument("--resume", action="store_true", help="go on with an interrupted campaign in the output folder")
+    _common(c, "helmstar-out/SCENARIO-SEED")
+    c.set_defaults(call=_run)
+
+    c = sub.add_parser(
+        "scenarios",
+        help="list the built-in scenarios, or print one as TOML",
+        description="List the built-in scenarios with their estimators' keys, or print one to start your own file from.",
+        epilog="""examples:
+  helmstar scenarios
+  helmstar scenarios xu2020 > mine.toml               edit it, then: helmstar run mine.toml""",
+        formatter_class=raw,
+    )
+    c.add_argument("scenario", nargs="?", help="print this scenario's TOML")
+    c.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    c.set_defaults(call=_scenarios)
+
+    c = sub.add_parser(
+        "attitude",
+        help="attitude and gyro drift from telemetry: gyro rates and star-tracker attitudes or star directions",
+        description="""Filter and smooth attitude and gyro drift (6 states) from CSV or Parquet telemetry.
+Native columns: time_s; gyro_x_rad_s, gyro_y_rad_s, gyro_z_rad_s; q_bn_x, q_bn_y, q_bn_z, q_bn_w (scalar last, N to B).
+They may stand in one table or in two; other layouts are mapped by [columns] in the configuration (docs/telemetry.md).""",
+        epilog="""examples:
+  helmstar attitude telemetry.csv
+  helmstar attitude gyro.csv startracker.parquet --config sensors.toml --out flight
+  helmstar attitude gyro.csv stars.csv --config sensors.toml --json > summary.json""",
+        formatter_class=raw,
+    )
+    c.add_argument("files", nargs="+", metavar="FILE", help="CSV or Parquet tables")
+    c.add_argument("--config", metavar="TOML", help="sensors.toml: columns, noise, mounting, gate (see docs/telemetry.md)")
+    c.add_argument("--strict", action="store_true", help="a bad row is an error instead of being dropped and reported")
+    c.add_argument("--csv", action="store_true", help="write tables as CSV instead of Parquet")
+    _common(c, "helmstar-out/attitude-FILE")
+    c.set_defaults(call=_attitude)
+
+    c = sub.add_parser(
+        "allan",
+        help="Allan deviation of gyro data: angle random walk, rate random walk, bias instability",
+        description="Allan deviation of gyro data with fitted noise parameters, printed as a [gyro] table for sensors.toml.",
+        epilog="""examples:
+  helmstar allan gyro.csv
+  helmstar allan gyro.csv --config columns.toml --json""",
+        formatter_class=raw,
+    )
+    c.add_argument("files", nargs="+", metavar="FILE", help="CSV or Parquet tables with gyro columns")
+    c.add_argument("--config", metavar="TOML", help="sensors.toml with [columns] and [gyro] reading")
+    c.add_argument("--strict", action="store_true", help="a bad row is an error instead of being dropped and reported")
+    _common(c, "helmstar-out/allan-FILE")
+    c.set_defaults(call=_allan)
+    return p
+
+
+def _common(c: argparse.ArgumentParser, default: str) -> None:
+    c.add_argument("--out", metavar="DIR", help=f"folder for results, created or reused (default: {default})")
+    c.add_argument("--json", action="store_true", help="one JSON object on stdout, progress on stderr")
+
+
+def _print_json(value: Any) -> None:
+    print(json.dumps(value, allow_nan=False))
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+def _command(args: argparse.Namespace) -> str:
+    """The command as typed, for the report."""
+    return "helmstar " + shlex.join(args.argv)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from .errors import ConfigurationError
+    from .scenarios.specification import build, load, parse_set
+
+    overrides = parse_set(args.set)
+    if args.runs is not None:
+        overrides["runs"] = args.runs
+    if args.seed is not None:
+        overrides["seed"] = args.seed
+    name, spec = load(args.scenario, overrides)
+    if args.workers is not None and args.workers < 1:
+        raise ConfigurationError(f"--workers {args.workers}: must be at least 1")
+    _say(f"{name}: {spec.runs} runs, seed {spec.seed}")
+    from .campaign import run_campaign
+
+    experiment = build(name, spec)
+    folder = Path(args.out or Path("helmstar-out") / f"{name}-{spec.seed}")
+    outcome = run_campaign(
+        experiment,
+        runs=spec.runs,
+        seed=spec.seed,
+        folder=folder,
+        specification=spec.model_dump(mode="json"),
+        configuration=_as_toml(spec.model_dump(mode="json", exclude_none=True)),
+        command=_command(args),
+        estimators=None if args.estimators is None else args.estimators.split(","),
+        resume=args.resume,
+        workers=args.workers,
+    )
+    from .report.monte_carlo import write_monte_carlo_report
+
+    claims = experiment.claims(outcome.dataset, outcome.summary)
+    report = write_monte_carlo_report(outcome.dataset, outcome.summary, claims, folder / "report.html")
+    (folder / "summary.json").write_text(json.dumps(outcome.summary, allow_nan=False, indent=2), encoding="utf-8")
+    if args.json:
+        _print_json(outcome.summary)
+    else:
+        from .report.terminal import print_campaign
+
+        print_campaign(outcome.summary)
+        print(f"report: {report.resolve()}")
+    if outcome.interrupted:
+        again = _command(args) + ("" if args.resume else " --resume")
+        _say(f"interrupted: {outcome.summary['runs']} of {spec.runs} runs are kept in {folder}; go on with: {again}")
+        return 130
+    return 0
+
+
+def _as_toml(value: dict[str, Any], prefix: str = "") -> str:
+    """A validated specification as TOML, for the report (values are numbers, strings and lists)."""
+    plain = [f"{k} = {json.dumps(v)}" for k, v in value.items() if not isinstance(v, dict)]
+    out = "\n".join(plain)
+    for k, v in value.items():
+        if isinstance(v, dict):
+            out += f"\n\n[{prefix}{k}]\n{_as_toml(v, f'{prefix}{k}.')}"
+    return out
+
+
+def _scenarios(args: argparse.Namespace) -> int:
+    import tomllib
+
+    from .errors import ConfigurationError
+    from .scenarios.specification import library
+
+    built_in = library()
+    if args.scenario is not None and args.scenario not in built_in:
+        raise ConfigurationError(f"scenario {args.scenario!r}: no such scenario; there are {', '.join(built_in)}")
+    if args.scenario is not None:
+        content = built_in[args.scenario]
+        if args.json:
+            _print_json(tomllib.loads(content))
+        else:
+            print(content, end="")
+        return 0
+    content = {name: tomllib.loads(text) for name, text in built_in.items()}
+    if args.json:
+        _print_json({"scenarios": [{"name": n, "title": c["title"], "runs": c["runs"]} for n, c in content.items()]})
+        return 0
+    for name, c in content.items():
+        print(f"{name:<12} {c['title']}")
+        print(f"{'':<12} {c['runs']} runs; print its keys: helmstar scenarios {name}; run it: helmstar run {name}")
+    return 0
+
+
+def _attitude(args: argparse.Namespace) -> int:
+    from .telemetry.command import run_attitude
+
+    stem = Path(args.files[0]).stem or "telemetry"
+    folder = Path(args.out or Path("helmstar-out") / f"attitude-{stem}")
+    result, report = run_attitude(
+        [Path(f) for f in args.files],
+        config=None if args.config is None else Path(args.config),
+        folder=folder,
+        strict=args.strict,
+        as_csv=args.csv,
+        command=_command(args),
+    )
+    if args.json:
+        _print_json(result)
+    else:
+        from .report.terminal import print_attitude
+
+        print_attitude(result)
+        print(f"report: {report.resolve()}")
+    return 0
+
+
+def _allan(args: argparse.Namespace) -> int:
+    from .telemetry.allan import run_allan
+
+    stem = Path(args.files[0]).stem or "gyro"
+    folder = Path(args.out or Path("helmstar-out") / f"allan-{stem}")
+    result, report = run_allan(
+        [Path(f) for f in args.files],
+        config=None if args.config is None else Path(args.config),
+        folder=folder,
+        strict=args.strict,
+        command=_command(args),
+    )
+    if args.json:
+        _print_json(result)
+    else:
+        print(result["sensors_toml"], end="")
+        print(f"report: {report.resolve()}")
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of the console command; returns the exit code."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    args = parser().parse_args(argv)
+    args.argv = argv
+    try:
+        return args.call(args)
+    except HelmstarError as error:
+        _say(f"error: {error}")
+        return 1
+    except KeyboardInterrupt:
+        _say("interrupted: nothing was finished")
+        return 130
+    except BrokenPipeError:  # `helmstar ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:
+        _say(f"error: {error.filename or ''}: {error.strerror or error}".replace(": :", ":"))
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
