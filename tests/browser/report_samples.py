@@ -18,7 +18,7 @@ def campaign(names=ALL, runs=100, times=1000, requested=None, spoil=False):
     bound = np.radians(0.0022) * np.array([1.0, 1.0, 0.8]) * np.ones((times, 1)) * (1 + 3 / update[:, None])
     errors, sigmas, nees, nis = [], [], [], []
     for name in names:
-        decay = 0.945 ** update if "tuned" not in name else 0.3**update
+        decay = 0.945**update if "tuned" not in name else 0.3**update
         if name == "lie_printed":
             decay = 1 / (1 + 0.02 * update) * np.cos(0.03 * update)
         start = np.radians(60.0) * np.array([1.0, -1.0, 1.0]) * (1 + 0.02 * rng.standard_normal((runs, 1, 1)))
@@ -50,7 +50,7 @@ def campaign(names=ALL, runs=100, times=1000, requested=None, spoil=False):
             "sigma_rad": ((*dims, "axis"), np.array(sigmas)),
             "nees": (dims, score),
             "nis": (dims, np.array(nis)),
-            "nis_dof": (dims, np.full(score.shape, 6 if times < 0 else 4)),
+            "nis_dof": (dims, np.full(score.shape, 4)),
             "truth_q_bn": (("time", "quaternion"), truth),
             "bound_rad": (("time", "axis"), bound),
             "us_per_step": (("estimator",), np.linspace(2.0, 40.0, len(names))),
@@ -123,7 +123,7 @@ def telemetry(rows=20000, gaps=True, spoil=False):
     updates["nis"] = np.where(status == "gated", 80.0, updates["nis"])
     for axis in "xyz":
         updates[f"residual_{axis}_arcsec"] = 1.1 * rng.standard_normal(rows) * np.where(status == "gated", 9.0, 1.0)
-        updates[f"sigma_residual_{axis}_arcsec"] = np.full(rows, 1.1)
+        updates[f"residual_sigma_{axis}_arcsec"] = np.full(rows, 1.1)
     frames["updates"] = pd.DataFrame(updates)
     if spoil:
         frames["filtered"].loc[5:9, "drift_x_arcsec_s"] = np.nan
@@ -141,11 +141,11 @@ def telemetry(rows=20000, gaps=True, spoil=False):
         "rows": {"gyro": rows, "star": rows},
         "gaps": [{**between, "what": "star"}] if gaps else [],
         "problems": [bad],
-        "parameters": [
-            {"name": "arw", "value": 0.05, "unit": "arcsec/sqrt(s)", "source": "estimated from the data"},
-            {"name": "sigma", "value": 1.0, "unit": "arcsec", "source": "sensors.toml"},
-        ],
-        "gate_probability": 1e-6,
+        "noise": {
+            "arw_arcsec_sqrt_s": {"value": 0.05, "source": "estimated from the data"},
+            "star_sigma_arcsec": {"value": [1.0, 1.0, 8.0], "source": "sensors.toml"},
+        },
+        "gate_limit": 30.66,
         "command": "helmstar attitude 'a<b>.csv' --config sensors.toml",
         "versions": {"helmstar": "0.1.0"},
     }

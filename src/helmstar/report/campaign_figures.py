@@ -16,10 +16,12 @@ from .numbers import (
     mean_over_runs,
     rotation_from_quaternion,
     tait_bryan_deg,
+    total_quantile,
 )
-from .page import Figure, Page
+from .page import Figure, Page, number
 
 GROUP = "estimator"
+WITHIN = 0.9973  # probability of 3 sigma
 PREFERRED = ("lie_tuned", "lie")
 
 
@@ -53,7 +55,7 @@ def add_paper_figures(page: Page, campaign: Campaign) -> None:
         late = figures.late_part(campaign.update)
         lower = np.abs(np.concatenate([error[late], difference[late]]))
         lower = lower[np.isfinite(lower)]
-        both = style.nice_limit(np.quantile(lower, 0.99)) if lower.size else None  # a spike shall not set the scale
+        both = style.nice_limit(np.quantile(lower, 0.95)) if lower.size else None  # a spike shall not set the scale
         update = campaign.update[index]
         page.heading(f"{title}: {name}" if "xu2020" in campaign.scenario else name)
         page.figures(
@@ -77,7 +79,7 @@ def add_paper_figures(page: Page, campaign: Campaign) -> None:
 def add_convergence(page: Page, campaign: Campaign) -> None:
     """Median total error of all estimators, those of the paper's tuning and the tuned ones side by side."""
     page.section("Convergence of all estimators", short="Convergence")
-    bound = np.sqrt(np.sum(campaign.bound[campaign.shown] ** 2, axis=1))
+    bound = total_quantile(campaign.bound[campaign.shown], 0.5)
     update = campaign.update[campaign.shown]
     groups = {
         "the paper's tuning": [name for name in campaign.names if not name.endswith(style.TUNED)],
@@ -116,10 +118,9 @@ def add_error(page: Page, campaign: Campaign) -> None:
             run: (campaign.update[index], _finite(campaign.totals[name][i, index]))
             for i, (run, index) in enumerate(chosen)
         }
+        within = total_quantile(sigma, WITHIN), total_quantile(bound, WITHIN)
         by_axis[name] = figures.error_by_axis(update, low, median, high, sigma, bound, name, singles)
-        total[name] = figures.error_total(
-            update, low_total, median_total, high_total, _root_sum(sigma), _root_sum(bound), name, totals
-        )
+        total[name] = figures.error_total(update, low_total, median_total, high_total, *within, name, totals)
     options: dict[str, Any] = {"select": "Estimator", "selected": _preferred(campaign), "group": GROUP}
     page.figure(
         by_axis,
@@ -131,8 +132,8 @@ def add_error(page: Page, campaign: Campaign) -> None:
     )
     page.figure(
         total,
-        "Total error angle: how fast the start-up fades, and where it settles relative to the bound (3σ lines are root "
-        "sums of squares over the three axes).",
+        "Total error angle: how fast the start-up fades, and where it settles. The 99.7% lines are what Gaussian errors "
+        "of the filter's own sigma, and of the bound, stay below.",
         alt="Total error angle in degrees on a logarithmic axis against the update, with quantiles, band and bound.",
         height=400,
         **options,
@@ -258,10 +259,6 @@ def _inside(values: np.ndarray, degrees: np.ndarray) -> float:
     return float(np.mean((values[finite] >= low) & (values[finite] <= high)))
 
 
-def _root_sum(values: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.sum(values * values, axis=-1))
-
-
 def _finite(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(values), values, np.nan)
 
@@ -274,4 +271,4 @@ def _fate(campaign: Campaign, name: str) -> str:
 
 
 def _vector(values: np.ndarray) -> str:
-    return ", ".join(f"{value:.2g}" if np.isfinite(value) else "no number" for value in values)
+    return ", ".join(number(value, 2) for value in values)

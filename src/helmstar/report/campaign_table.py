@@ -119,7 +119,7 @@ def _best(campaign: Campaign) -> tuple[str, float, float | None] | None:
     }
     if not ratios:
         return None
-    name = min(ratios, key=lambda one: abs(np.log(ratios[one])))
+    name = min(ratios, key=lambda one: round(abs(float(np.log(ratios[one]))), 2))  # of equals the first
     return name, ratios[name], campaign.figures(name).get("nees_mean")
 
 

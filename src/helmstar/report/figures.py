@@ -88,7 +88,7 @@ def error_total(
     name: str,
     singles: Singles,
 ) -> FigureDict:
-    """Total error angle (time,) in degrees; sigma and bound are root sums of squares over the axes."""
+    """Total error angle (time,) in degrees; sigma and bound are what 99.7% of Gaussian errors of their size stay below."""
     colour = estimator_style(name)[0]
     several = len(singles) != 1 or bool(np.any(low != high))
     hover = "update %{x}<br>%{y:.4g} deg"
@@ -99,20 +99,20 @@ def error_total(
         traces.append(line(at, values, label, style.GREY, width=0.8, opacity=0.75, **more))
     if several:
         traces.append(line(update, median, "median", colour, width=2.2, hover=hover))
-    traces.append(line(update, 3 * sigma, "3σ of the filter", style.AMBER, dash="dot", hover=hover))
-    traces.append(line(update, 3 * bound, "3σ Cramér-Rao bound", style.RED, width=1.6, dash="dash", hover=hover))
+    traces.append(line(update, sigma, "99.7% by the filter", style.AMBER, dash="dot", hover=hover))
+    traces.append(line(update, bound, "99.7% at the bound", style.RED, width=1.6, dash="dash", hover=hover))
     views = {
         "Logarithmic": {"yaxis.type": "log"},
         "Linear": {"yaxis.type": "linear", "yaxis.dtick": None, "yaxis.rangemode": "tozero"},
     }
     return {
         "data": traces,
-        "layout": layout({"views": views}, xaxis=axis(UPDATE), yaxis=log_axis("Total error (deg)")),
+        "layout": layout({"views": views}, xaxis=axis(UPDATE), yaxis=log_axis("Total error (deg)", low, high, bound)),
     }
 
 
 def convergence(update: np.ndarray, medians: Mapping[str, np.ndarray], bound: np.ndarray) -> FigureDict:
-    """Median over runs of the total error angle (deg) by estimator; markers are staggered so that equal lines show."""
+    """Median over runs of the total angle (deg) by estimator, and at the bound; staggered markers tell equal lines apart."""
     traces = []
     count, start = len(medians), min(150, int(update[-1]))
     marked_x = np.linspace(0, update[-1], 8)[1:]
@@ -129,13 +129,15 @@ def convergence(update: np.ndarray, medians: Mapping[str, np.ndarray], bound: np
         trace = line(update, median, name, colour, width=1.8, dash=dash, hover="update %{x}<br>%{y:.4g} deg")
         trace |= {"mode": "lines+markers", "marker": {"symbol": symbol, "size": size, "color": colour, "opacity": 1}}
         traces.append(trace)
-    traces.append(line(update, bound, "Cramér-Rao bound", style.INK, width=1.4, dash="dot", hover="%{y:.4g} deg"))
+    traces.append(line(update, bound, "median at the bound", style.INK, width=1.4, dash="dot", hover="%{y:.4g} deg"))
     views: dict[str, Any] = {"Whole": {"xaxis.autorange": True}}
     if update[-1] > 2 * start:
         views = {f"First {start} updates": {"xaxis.range": [0, start]}, **views}
     return {
         "data": traces,
-        "layout": layout({"views": views}, xaxis=axis(UPDATE), yaxis=log_axis("Median total error (deg)")),
+        "layout": layout(
+            {"views": views}, xaxis=axis(UPDATE), yaxis=log_axis("Median total error (deg)", bound, *medians.values())
+        ),
     }
 
 
@@ -205,7 +207,7 @@ def settling(settled: Mapping[str, Mapping[str, np.ndarray]]) -> FigureDict:
     note = f"No run settles: {', '.join(never)}." if never else ""
     labels = {"tickvals": list(range(len(names))), "ticktext": [style.wrapped(name) for name in names]}
     y_axis = axis("", range=[len(names) - 0.4, -0.6], **labels)
-    x_axis = axis("Update at which a run settles", type="log", exponentformat="none", dtick="D2")
+    x_axis = log_axis("Update at which a run settles", *[trace["x"] for trace in traces])
     return {"data": traces, "layout": layout({"note": note}, xaxis=x_axis, yaxis=y_axis)}
 
 
@@ -226,7 +228,8 @@ def settling_histogram(settled: Mapping[str, np.ndarray], last: float, name: str
                 "type": "bar",
                 "x": edges[kept] + 0.5 * step,
                 "y": counts[kept],
-                "width": 0.92 * step,
+                "width": 0.45 * step,
+                "offset": (-0.46 if i == 0 else 0.01) * step,
                 "name": f"below {threshold}",
                 "marker": {"color": style.faded(colours[i % 2], 0.75), "line": {"width": 0}},
                 "hovertemplate": "update %{x}: %{y} runs<extra></extra>",
@@ -286,7 +289,8 @@ def bound_ratio(ratios: Mapping[str, Sequence[float | None]]) -> FigureDict:
         })  # fmt: skip
     red = {"color": style.RED, "width": 1.5}
     one = {"type": "line", "x0": 1, "x1": 1, "yref": "paper", "y0": 0, "y1": 1, "line": red}
-    x_axis = axis("RMS error / Cramér-Rao bound", type="log", exponentformat="none", dtick="D2")
+    marks = [value for found in ratios.values() for value in found if value]
+    x_axis = log_axis("RMS error / Cramér-Rao bound", marks, exponentformat="power")
     return {
         "data": traces,
         "layout": layout(xaxis=x_axis, yaxis=axis("", autorange="reversed", type="category"), shapes=[one]),

@@ -29,6 +29,16 @@ def total_angle(error: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(angle), np.inf, angle)
 
 
+def total_quantile(sigma: np.ndarray, probability: float) -> np.ndarray:
+    """Quantile of |e| for e ~ N(0, diag(sigma^2)), sigma (..., 3): a gamma law of the same mean and variance for |e|^2."""
+    from scipy.special import gammaincinv
+
+    squares = sigma * sigma
+    mean, variance = squares.sum(axis=-1), 2.0 * (squares * squares).sum(axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.sqrt(gammaincinv(mean * mean / variance, probability) * variance / mean)
+
+
 def settled_at(angle: np.ndarray, update: np.ndarray, threshold: float) -> np.ndarray:
     """The update at which each series (..., time) goes below the threshold and stays; NaN if it never does."""
     above = ~(angle < threshold)

@@ -56,9 +56,13 @@ def axis(title: str, **more: Any) -> dict[str, Any]:
     }
 
 
-def log_axis(title: str, **more: Any) -> dict[str, Any]:
-    """A logarithmic axis: one label per decade, written out (0.001, 0.01, ...)."""
-    return axis(title, type="log", dtick=1, **{"exponentformat": "none", **more})
+def log_axis(title: str, *series: Any, **more: Any) -> dict[str, Any]:
+    """A logarithmic axis, labels written out (0.001, 0.01, ...): as many per decade as the range of the series allows."""
+    values = np.concatenate([np.zeros(0), *[np.ravel(np.asarray(one, dtype=float)) for one in series]])
+    values = values[np.isfinite(values) & (values > 0.0)]
+    decades = float(np.log10(values.max() / values.min())) if values.size else 9.0
+    dtick = "D1" if decades < 0.7 else "D2" if decades < 2.5 else 1
+    return axis(title, type="log", dtick=dtick, **{"exponentformat": "none", **more})
 
 
 def layout(meta: dict[str, Any] | None = None, **parts: Any) -> dict[str, Any]:

@@ -1,15 +1,15 @@
 """The report of `helmstar attitude`: one page from its JSON object and its tables.
 
 `result` (the object of --json; whatever is missing is left out): `files` (list of str), `drift_arcsec_s` and
-`drift_sigma_arcsec_s` ([x, y, z] at the end), `nis_mean`, `nis_band` ([low, high] of its mean), `rows_rejected`,
-`rows` ({what: count}), `gaps` (list of {start_s, end_s, duration_s, what}), `problems` (list of {file, row, kind,
-message, action}, and `rows` if one stands for several), `parameters` (list of {name, value, unit, source}, source being
-"sensors.toml", "default" or "estimated from the data"), `gate_probability`, `sensors_toml` (text), `command`,
+`drift_sigma_arcsec_s` ([x, y, z] at the end), `nis_mean`, `nis_dof_mean`, `nis_band` ([low, high] of its mean),
+`rows_rejected`, `rows` ({what: count}), `gaps` (list of {start_s, end_s, duration_s, what}), `problems` (list of {file, row, kind,
+message, action}, and `rows` if one stands for several), `noise` ({name with unit: {value, source}}, the
+source being "sensors.toml" or "estimated from the data"), `gate_limit` (of NIS at 3 degrees of freedom), `sensors_toml` (text), `command`,
 `versions`.
 
 `frames`: "filtered" and "smoothed" (time_s, q_bn_x .. q_bn_w, drift_x_arcsec_s .., sigma_attitude_x_arcsec ..,
 sigma_drift_x_arcsec_s ..) and "updates" (time_s, nis, nis_dof, status "accepted", "gated" or "reopened",
-residual_x_arcsec .. in B, and optionally sigma_residual_x_arcsec ..).
+residual_x_arcsec .. in B, and optionally residual_sigma_x_arcsec ..).
 """
 
 from __future__ import annotations
@@ -47,14 +47,12 @@ def telemetry_page(result: dict[str, Any], frames: Mapping[str, pandas.DataFrame
     _add_quality(page, result)
     page.section("Noise parameters and their source", short="Parameters")
     rows = [
-        [item.get("name"), _value(item.get("value")), item.get("unit", ""), item.get("source", "")]
-        for item in result.get("parameters") or []
+        [name, _value(item.get("value")), item.get("source", "")] for name, item in (result.get("noise") or {}).items()
     ]
     if rows:
         columns = [
             Column("Parameter", align="left"),
-            Column("Value", align="right", digits=5),
-            Column("Unit", align="left"),
+            Column("Value", "in the unit of its name", digits=5),
             Column("Source", align="left"),
         ]
         page.table(columns, rows, caption="What the filter assumed about the sensors.", cards=True)
@@ -83,9 +81,9 @@ def _headline(result: dict[str, Any]) -> tuple[str, ...]:
             word = f", {state} its band {number(limits[0])} to {number(limits[1])}"
         parts.append(f"mean NIS {number(mean)}{word}")
     counts = [
-        _count(result.get("rows_rejected") or 0, "row") + " refused by the gate",
+        _count(result.get("rows_rejected") or 0, "row") + " rejected",
         _count(len(result.get("gaps") or []), "gap"),
-        _count(_problem_rows(result), "bad row") + " in the files",
+        _count(_problem_rows(result), "bad row") + " found in the files",
     ]
     more = ", ".join(counts) + "."
     return ("; ".join(parts) + "." if parts else "The series was processed."), more
@@ -161,15 +159,16 @@ def _add_figures(page: Page, result: dict[str, Any], frames: Mapping[str, pandas
 
 
 def _gate(result: dict[str, Any], updates: pandas.DataFrame) -> np.ndarray | None:
-    probability = result.get("gate_probability")
-    if not probability or "nis_dof" not in updates:
+    """The gate over its degrees of freedom for each update, from the limit at 3 degrees of freedom."""
+    limit = result.get("gate_limit")
+    if not limit or "nis_dof" not in updates:
         return None
-    from scipy.special import gammainccinv
+    from scipy.special import gammaincc, gammainccinv
 
+    probability = gammaincc(1.5, 0.5 * limit)
     dof = np.asarray(updates["nis_dof"], dtype=float)
-    safe = np.where(dof > 0, dof, np.nan)
-    found = {value: 2.0 * float(gammainccinv(0.5 * value, probability)) / value for value in np.unique(safe[dof > 0])}
-    return np.array([found.get(value, np.nan) for value in safe])
+    found = {value: 2.0 * float(gammainccinv(0.5 * value, probability)) / value for value in np.unique(dof[dof > 0])}
+    return np.array([found.get(value, np.nan) for value in dof])
 
 
 def _add_quality(page: Page, result: dict[str, Any]) -> None:

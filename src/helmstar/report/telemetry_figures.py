@@ -94,7 +94,7 @@ def drift(frames: Mapping[str, Any], clock: Clock, shapes: list[dict[str, Any]])
 def attitude_sigma(frames: Mapping[str, Any], clock: Clock, shapes: list[dict[str, Any]]) -> dict[str, Any]:
     """1 sigma of the attitude per axis over time, filtered dashed and smoothed solid, logarithmic."""
     traces = []
-    few_decades = True
+    shown = []
     for kind, dash in (("filtered", "dot"), ("smoothed", "solid")):
         if kind not in frames:
             continue
@@ -102,24 +102,23 @@ def attitude_sigma(frames: Mapping[str, Any], clock: Clock, shapes: list[dict[st
         for i, name in enumerate(AXES):
             sigma = _column(frames[kind], f"sigma_attitude_{name}_arcsec")
             index = extremes(sigma, SMOOTH)
-            positive = sigma[sigma > 0]
-            few_decades &= not positive.size or bool(positive.max() < 10.0 * positive.min())
+            shown.append(sigma[index])
             hover = f"%{{x:.5g}} {clock.unit}<br>%{{y:.4g}} arcsec"
             colour = style.AXIS_COLOURS[i]
             traces.append(line(time[index], sigma[index], f"{name} {kind}", colour, width=1.5, dash=dash, hover=hover))
-    y_axis = axis("Attitude sigma (arcsec)", type="log", exponentformat="none", dtick="D1" if few_decades else "D2")
+    y_axis = style.log_axis("Attitude sigma (arcsec)", *shown)
     return {"data": traces, "layout": layout(shapes=shapes, xaxis=axis(clock.title), yaxis=y_axis)}
 
 
 def residuals(updates: Any, clock: Clock, shapes: list[dict[str, Any]]) -> dict[str, Any]:
-    """Attitude residuals per axis in B; with their predicted 3 sigma if `sigma_residual_x_arcsec`, ... are there."""
+    """Attitude residuals per axis in B; with their predicted 3 sigma if `residual_sigma_x_arcsec`, ... are there."""
     traces: list[dict[str, Any]] = []
     time, status = clock(_column(updates, "time_s")), _status(updates)
     used, views = status != "gated", {"Used rows": {}}
     for i, name in enumerate(AXES):
         place = {**on(i), **({} if i == 0 else {"showlegend": False})}
         value = _column(updates, f"residual_{name}_arcsec")
-        sigma = _column(updates, f"sigma_residual_{name}_arcsec")
+        sigma = _column(updates, f"residual_sigma_{name}_arcsec")
         if np.isfinite(sigma).any():
             index = spread(len(sigma), SMOOTH, 0)
             limit = 3 * sigma[index]

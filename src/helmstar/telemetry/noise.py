@@ -2,7 +2,7 @@
 
 The gyro is integrated from epoch to epoch of the stars, and the same 6-state filter runs over epochs for many candidates
 at once; the likelihood of its innovations chooses. First with a Student likelihood that a few outliers cannot move, then,
-with the epochs that the gate refuses left out, with the Gaussian one.
+with the epochs that the gate refuses left out, with the Gaussian one: so what the gate accepts is consistent.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def _search(
     low = np.array([bounds[n][0] for n in names])
     high = np.array([bounds[n][1] for n in names])
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
-    count = {1: 64, 2: 16, 3: 8}[len(names)]
+    count = {1: 64, 2: 16, 3: 6}[len(names)]
     best = centre
     for _ in range(8):
         axes = [np.clip(np.linspace(c - h, c + h, count), a, b) for c, h, a, b in zip(centre, half, low, high, strict=True)]
@@ -175,7 +175,7 @@ def _search(
         value = np.concatenate(values)
         value = np.where(np.isfinite(value), value, -np.inf)
         best = points[int(np.argmax(value))]
-        centre, half = best, half * (2.5 / (count - 1) if count > 8 else 0.45)
+        centre, half = best, half * (2.5 / (count - 1) if count > 6 else 0.5)
         if np.max(half) < 0.01:
             break
     return dict(zip(names, (float(v) for v in np.exp(best)), strict=True))

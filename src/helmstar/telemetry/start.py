@@ -2,8 +2,8 @@
 
 From one attitude to the next the gyro alone predicts q-; what is measured differs by e = log(q (x) q-^-1) = J b, the drift
 b acting through J = integral of the turn (see `noise.integrate_gyro`), so b = J^-1 e with the covariance of two attitudes
-and of the walk between them. The filter starts at the first attitude with that drift as its mean and a sigma a hundred
-times as wide: so the second attitude is not used twice, and after it the filter has the covariance of the difference.
+and of the walk between them. The filter starts at the first attitude with that drift as its mean and a sigma ten times
+as wide: so the second attitude counts twice by a hundredth only, and after it the filter has the difference's covariance.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .timeline import Epochs, Timeline
 
 LOOK = 11
 """Attitudes that are looked at to find a first pair that agrees with the rest."""
-DIFFUSE = 100.0
+DIFFUSE = 10.0
 STEPS = 4096
 """Steps of one compiled call of the integration."""
 
