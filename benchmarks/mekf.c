@@ -184,3 +184,10 @@ void run(int runs, int steps, double dt, double sv, double su, double sigma, dou
         }
     }
 }
+
+/* Steps of one run from and into the caller's state, for a caller that streams: q (4), b (3), P (6, 6). */
+void stream_loop(int steps, double dt, double sv, double su, double sigma, double *q, double *b, double *P,
+                 const double *u, const double *z, double *nis) {
+    const double r[2][3] = {{1, 0, 0}, {0, 1, 0}};
+    for (int k = 0; k < steps; k++) step(q, b, (double (*)[6])P, u + 3 * k, dt, sv, su, z + 6 * k, r, sigma, nis + k);
+}

@@ -132,8 +132,8 @@ def add_error(page: Page, campaign: Campaign) -> None:
     )
     page.figure(
         total,
-        "Total error angle: how fast the start-up fades, and where it settles. The 99.7% lines are what Gaussian errors "
-        "of the filter's own sigma, and of the bound, stay below.",
+        "Total error angle: how fast the start-up fades, and where it settles. The 99.7% lines are what Gaussian "
+        "errors of the filter's own sigma, and of the bound, stay below.",
         alt="Total error angle in degrees on a logarithmic axis against the update, with quantiles, band and bound.",
         height=400,
         **options,

@@ -88,7 +88,7 @@ def error_total(
     name: str,
     singles: Singles,
 ) -> FigureDict:
-    """Total error angle (time,) in degrees; sigma and bound are what 99.7% of Gaussian errors of their size stay below."""
+    """Total error angle (time,) in degrees; sigma and bound: what 99.7% of Gaussian errors of their size stay below."""
     colour = estimator_style(name)[0]
     several = len(singles) != 1 or bool(np.any(low != high))
     hover = "update %{x}<br>%{y:.4g} deg"
@@ -112,7 +112,7 @@ def error_total(
 
 
 def convergence(update: np.ndarray, medians: Mapping[str, np.ndarray], bound: np.ndarray) -> FigureDict:
-    """Median over runs of the total angle (deg) by estimator, and at the bound; staggered markers tell equal lines apart."""
+    """Median total angle (deg) by estimator, and at the bound; staggered markers tell equal lines apart."""
     traces = []
     count, start = len(medians), min(150, int(update[-1]))
     marked_x = np.linspace(0, update[-1], 8)[1:]

@@ -30,7 +30,7 @@ def total_angle(error: np.ndarray) -> np.ndarray:
 
 
 def total_quantile(sigma: np.ndarray, probability: float) -> np.ndarray:
-    """Quantile of |e| for e ~ N(0, diag(sigma^2)), sigma (..., 3): a gamma law of the same mean and variance for |e|^2."""
+    """Quantile of |e| for e ~ N(0, diag(sigma^2)), sigma (..., 3), by a gamma law of |e|^2's mean and variance."""
     from scipy.special import gammaincinv
 
     squares = sigma * sigma

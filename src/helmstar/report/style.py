@@ -57,7 +57,7 @@ def axis(title: str, **more: Any) -> dict[str, Any]:
 
 
 def log_axis(title: str, *series: Any, **more: Any) -> dict[str, Any]:
-    """A logarithmic axis, labels written out (0.001, 0.01, ...): as many per decade as the range of the series allows."""
+    """A logarithmic axis, labels written out (0.001, 0.01, ...): as many per decade as the series' range asks."""
     values = np.concatenate([np.zeros(0), *[np.ravel(np.asarray(one, dtype=float)) for one in series]])
     values = values[np.isfinite(values) & (values > 0.0)]
     decades = float(np.log10(values.max() / values.min())) if values.size else 9.0

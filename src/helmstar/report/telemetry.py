@@ -1,15 +1,20 @@
 """The report of `helmstar attitude`: one page from its JSON object and its tables.
 
-`result` (the object of --json; whatever is missing is left out): `files` (list of str), `drift_arcsec_s` and
-`drift_sigma_arcsec_s` ([x, y, z] at the end), `nis_mean`, `nis_dof_mean`, `nis_band` ([low, high] of its mean),
-`rows_rejected`, `rows` ({what: count}), `gaps` (list of {start_s, end_s, duration_s, what}), `problems` (list of {file, row, kind,
-message, action}, and `rows` if one stands for several), `noise` ({name with unit: {value, source}}, the
-source being "sensors.toml" or "estimated from the data"), `gate_limit` (of NIS at 3 degrees of freedom), `sensors_toml` (text), `command`,
-`versions`.
+`result` is the object of --json; whatever is missing is left out of the page:
+
+| key | holds |
+|---|---|
+| files, command, versions, rows | list of str, str, {name: version}, {what: count} |
+| drift_arcsec_s, drift_sigma_arcsec_s | [x, y, z] at the end |
+| nis_mean, nis_band | mean over the accepted updates, [low, high] of it |
+| rows_rejected, gaps | count, list of {start_s, end_s, duration_s, what} |
+| problems | list of {file, row, kind, message, action}, and `rows` if one stands for several |
+| noise | {name with unit: {value, source}}, source "sensors.toml" or "estimated from the data" |
+| gate_limit, sensors_toml, title, headline | limit of NIS at 3 degrees of freedom; texts |
 
 `frames`: "filtered" and "smoothed" (time_s, q_bn_x .. q_bn_w, drift_x_arcsec_s .., sigma_attitude_x_arcsec ..,
 sigma_drift_x_arcsec_s ..) and "updates" (time_s, nis, nis_dof, status "accepted", "gated" or "reopened",
-residual_x_arcsec .. in B, and optionally residual_sigma_x_arcsec ..).
+residual_x_arcsec .. in B, and optionally residual_sigma_x_arcsec ..). `gaps` and frames share one clock.
 """
 
 from __future__ import annotations
