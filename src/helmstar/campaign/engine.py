@@ -19,6 +19,10 @@ from ..backend import COMPILER_OPTIONS, jax, jnp
 from ..scenarios.experiment import Call, Experiment
 
 
+_PROGRAMS: dict[Any, Any] = {}
+"""Compiled programs of this process: a second campaign with other data compiles nothing."""
+
+
 @dataclass(frozen=True)
 class Block:
     """Results of one block: runs (width,) their numbers, arrays[estimator][variable] (width, time, ...), and seconds of
@@ -41,7 +45,6 @@ class Engine:
     def __init__(self, experiment: Experiment, names: Iterable[str]):
         self.experiment = experiment
         self.names = tuple(names)
-        self._programs: dict[Any, Any] = {}
         ids = jnp.arange(experiment.width)
         sim = experiment.simulate
         self._data_shape = jax.eval_shape(sim.function, *sim.arguments, ids)
@@ -56,8 +59,8 @@ class Engine:
 
     @property
     def programs(self) -> int:
-        """How many different programs there are to compile."""
-        return len(self._jobs)
+        """How many programs there are still to compile."""
+        return len(self._missing())
 
     def compile(self, workers: int, done: Callable[[], None] = lambda: None) -> None:
         """Compile all programs, `workers` at a time; `done` is called after each."""
@@ -67,21 +70,24 @@ class Engine:
             return key, call.function.lower(*call.arguments, data, **call.static).compile(COMPILER_OPTIONS)
 
         with ThreadPoolExecutor(workers) as pool:
-            for future in as_completed([pool.submit(job, key) for key in self._jobs if key not in self._programs]):
+            for future in as_completed([pool.submit(job, key) for key in self._missing()]):
                 key, program = future.result()
-                self._programs[key] = program
+                _PROGRAMS[key] = program
                 done()
+
+    def _missing(self) -> list[Any]:
+        return [key for key in self._jobs if key not in _PROGRAMS]
 
     def compute(self, index: int, done: Callable[[], None] = lambda: None) -> Block:
         """One block; `done` is called after each estimator."""
         e = self.experiment
         runs = np.arange(index * e.width, (index + 1) * e.width)
         ids = jnp.asarray(runs)
-        data = jax.block_until_ready(self._programs[self._key(e.simulate, ids)](*e.simulate.arguments, ids))
+        data = jax.block_until_ready(_PROGRAMS[self._key(e.simulate, ids)](*e.simulate.arguments, ids))
         arrays, seconds = {}, {}
         for name in self.names:
             call = e.estimators[name]
-            program = self._programs[self._key(call, self._data_shape)]
+            program = _PROGRAMS[self._key(call, self._data_shape)]
             start = time.perf_counter()
             result = jax.block_until_ready(program(*call.arguments, data))
             seconds[name] = time.perf_counter() - start

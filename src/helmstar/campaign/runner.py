@@ -91,9 +91,10 @@ def run_campaign(
     with Progress(progress) as bar:
         try:
             if todo:
-                task = bar.add(f"compiling {engine.programs} programs", engine.programs)
-                engine.compile(workers, lambda: bar.advance(task))
-                bar.finish(task)
+                if engine.programs:
+                    task = bar.add(f"compiling {engine.programs} programs", engine.programs)
+                    engine.compile(workers, lambda: bar.advance(task))
+                    bar.finish(task)
                 interrupted = _compute(engine, store, todo, workers, bar, experiment.width, runs)
         except KeyboardInterrupt:
             interrupted = True

@@ -15,7 +15,7 @@ def print_campaign(summary: dict[str, Any]) -> None:
     last = list(next(iter(summary["estimators"].values()))["median_error_deg"])[-1]
     print(f"{summary['scenario']}: {runs} runs, seed {summary['seed']}, {summary['wall_s']:.1f} s")
     heads = ("estimator", "median deg", "< 1 deg", "by", "diverged", "NEES/3", "/ bound")
-    widths = (30, 10, 8, 6, 8, 8, 8)
+    widths = (30, 11, 9, 6, 9, 8, 8)
     print("".join(h.ljust(w) if i == 0 else h.rjust(w) for i, (h, w) in enumerate(zip(heads, widths, strict=True))))
     for name, m in summary["estimators"].items():
         ratio = [v for v in m["rms_over_bound"] if v is not None]
@@ -31,7 +31,8 @@ def print_campaign(summary: dict[str, Any]) -> None:
         )
         print("".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))))
     print(f"median deg: total error at update {last}; by: update from which all runs stay below 1 deg;")
-    print("NEES/3: 1 when consistent; / bound: largest RMS over the Cramer-Rao bound, updates 200 to 600")
+    print("NEES/3: 1 when consistent; / bound: largest RMS over the Cramer-Rao bound;")
+    print("both over updates 200 to 600")
 
 
 def print_attitude(result: dict[str, Any]) -> None:

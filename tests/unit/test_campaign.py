@@ -1,0 +1,237 @@
+"""Campaigns: the same bits however the work is split, resumed or cut short; nothing finished is lost."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from helmstar.campaign import engine as engine_module
+from helmstar.campaign import run_campaign
+from helmstar.campaign.engine import Engine
+from helmstar.campaign.runner import choose
+from helmstar.errors import CampaignError, ConfigurationError
+from helmstar.scenarios import build, load
+
+SMALL = {"updates": 20, "width": 4}
+
+
+def prepared(**overrides):
+    name, spec = load("xu2020", SMALL | {k.replace("__", "."): v for k, v in overrides.items()})
+    return build(name, spec), spec
+
+
+def run(folder: Path, runs: int, names=("lie", "mekf_tuned"), resume=False, workers=1, **overrides):
+    experiment, spec = prepared(**overrides)
+    return run_campaign(
+        experiment,
+        runs=runs,
+        seed=spec.seed,
+        folder=folder,
+        specification=spec.model_dump(mode="json"),
+        configuration="",
+        command="helmstar run xu2020",
+        estimators=names,
+        resume=resume,
+        workers=workers,
+        progress=False,
+    )
+
+
+def same_bits(a: xr.Dataset, b: xr.Dataset) -> bool:
+    return all(
+        np.array_equal(a[v].values, b[v].values, equal_nan=True)
+        for v in ("error_rad", "sigma_rad", "nees", "nis", "nis_dof", "truth_q_bn", "bound_rad")
+    )
+
+
+@pytest.fixture(scope="module")
+def eleven(tmp_path_factory):
+    return run(tmp_path_factory.mktemp("eleven"), 11)
+
+
+def test_a_dataset_with_dims_units_and_frames(eleven):
+    d = eleven.dataset
+    assert dict(d.sizes) == {"estimator": 2, "run": 11, "time": 20, "axis": 3, "quaternion": 4}
+    assert d["error_rad"].attrs["units"] == "rad"
+    assert d["error_rad"].attrs["frame"] == "N"
+    assert d["update"].values.tolist() == list(range(1, 21))
+    assert np.isfinite(d["error_rad"].values).all()
+
+
+def test_results_on_disk_are_the_results(eleven, tmp_path):
+    outcome = run(tmp_path, 11)
+    with xr.open_dataset(tmp_path / "results.nc", engine="h5netcdf") as d:
+        assert same_bits(d.load(), eleven.dataset)
+        assert d.attrs["runs"] == 11
+    assert not [f for f in tmp_path.rglob("*") if f.suffix in (".pkl", ".pickle", ".part")]
+    assert outcome.summary["estimators"].keys() == {"lie", "mekf_tuned"}
+
+
+def test_the_bits_do_not_depend_on_runs_workers_or_resume(eleven, tmp_path):
+    few = run(tmp_path / "a", 3)
+    assert same_bits(few.dataset, eleven.dataset.isel(run=slice(0, 3)))
+    assert same_bits(run(tmp_path / "b", 11, workers=2).dataset, eleven.dataset)
+    again = run(tmp_path / "a", 11, resume=True)
+    assert same_bits(again.dataset, eleven.dataset)
+
+
+def test_another_estimator_leaves_the_others_as_they_are(eleven, tmp_path):
+    more = run(tmp_path, 11, names=("lie", "static_svd", "mekf_tuned")).dataset.sel(estimator=["lie", "mekf_tuned"])
+    assert same_bits(more, eleven.dataset)
+
+
+def test_another_width_draws_the_same_noise(eleven, tmp_path):
+    """Other programs may round differently: the attitudes agree within 1e-11 rad."""
+    other = run(tmp_path, 11, width=5)
+    assert np.abs(other.dataset["error_rad"].values - eleven.dataset["error_rad"].values).max() < 1e-11
+
+
+def test_another_seed_is_another_draw(eleven, tmp_path):
+    assert not same_bits(run(tmp_path, 11, seed=1).dataset, eleven.dataset)
+
+
+def test_runs_are_different_from_each_other(eleven):
+    e = eleven.dataset["error_rad"].values[0]
+    assert len(np.unique(e[:, -1, 0])) == 11
+
+
+def test_a_longer_campaign_begins_with_the_same_draws(eleven, tmp_path):
+    longer = run(tmp_path, 4, updates=30).dataset
+    difference = longer["error_rad"].values[:, :, :20] - eleven.dataset["error_rad"].values[:, :4]
+    assert np.abs(difference).max() < 1e-11
+
+
+def test_resume_computes_only_what_is_missing(tmp_path, monkeypatch):
+    run(tmp_path, 8)
+    computed = []
+    compute = Engine.compute
+    monkeypatch.setattr(Engine, "compute", lambda self, i, *a: (computed.append(i), compute(self, i, *a))[1])
+    run(tmp_path, 12, resume=True)
+    assert computed == [2]
+
+
+def test_ctrl_c_keeps_what_is_finished_and_resume_goes_on(tmp_path, monkeypatch, eleven):
+    compute = Engine.compute
+    calls = []
+
+    def interrupted(self, index, *args):
+        if index == 2:
+            raise KeyboardInterrupt
+        calls.append(index)
+        return compute(self, index, *args)
+
+    # A KeyboardInterrupt in the waiting main thread is what Ctrl-C gives; here it comes out of wait().
+    import helmstar.campaign.runner as runner
+
+    wait = runner.wait
+
+    def waiting(pending, **kwargs):
+        done = wait(pending, **kwargs)
+        if len(calls) == 2:
+            calls.append(None)
+            raise KeyboardInterrupt
+        return done
+
+    monkeypatch.setattr(Engine, "compute", interrupted)
+    monkeypatch.setattr(runner, "wait", waiting)
+    outcome = run(tmp_path, 11)
+    assert outcome.interrupted
+    assert outcome.summary["runs"] == 8
+    assert outcome.dataset.attrs["requested_runs"] == 11
+    monkeypatch.undo()
+    whole = run(tmp_path, 11, resume=True)
+    assert not whole.interrupted
+    assert same_bits(whole.dataset, eleven.dataset)
+
+
+def test_ctrl_c_before_anything_is_finished(tmp_path, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    import helmstar.campaign.runner as runner
+
+    monkeypatch.setattr(runner, "_compute", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, 4)
+
+
+def test_a_crash_keeps_finished_blocks(tmp_path, monkeypatch):
+    compute = Engine.compute
+
+    def crash(self, index, *args):
+        if index == 1:
+            raise RuntimeError("out of memory")
+        return compute(self, index, *args)
+
+    monkeypatch.setattr(Engine, "compute", crash)
+    with pytest.raises(CampaignError, match="out of memory.*4 runs are kept"):
+        run(tmp_path, 8)
+    monkeypatch.undo()
+    assert run(tmp_path, 8, resume=True).summary["runs"] == 8
+
+
+def test_a_damaged_block_is_computed_again(tmp_path, eleven):
+    run(tmp_path, 11)
+    (tmp_path / "blocks" / "000001.nc").write_bytes(b"rubbish")
+    with pytest.raises(CampaignError, match="--resume computes it again"):
+        run(tmp_path, 11, resume=True)
+    assert same_bits(run(tmp_path, 11, resume=True).dataset, eleven.dataset)
+
+
+def test_resume_refuses_another_campaign_and_names_what_differs(tmp_path):
+    run(tmp_path, 4)
+    with pytest.raises(CampaignError, match=r"star\.sigma_arcsec"):
+        run(tmp_path, 4, resume=True, star__sigma_arcsec=5)
+    with pytest.raises(CampaignError, match="seed"):
+        run(tmp_path, 4, resume=True, seed=9)
+
+
+def test_resume_without_a_campaign_or_with_a_damaged_manifest(tmp_path):
+    with pytest.raises(CampaignError, match="holds no campaign"):
+        run(tmp_path, 4, resume=True)
+    (tmp_path / "campaign.json").write_text("{")
+    with pytest.raises(CampaignError, match="damaged"):
+        run(tmp_path, 4, resume=True)
+
+
+def test_an_output_folder_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(CampaignError, match="cannot write"):
+        run(tmp_path / "file" / "below", 4)
+
+
+def test_tunings_and_twins_share_programs():
+    experiment, _ = prepared()
+    engine = Engine(experiment, experiment.estimators)
+    # simulate; right EKF printed and consistent; left; gibbs; additive (one and two stars); UKF; static
+    assert len(engine._jobs) == 8
+    other, _ = prepared(tuning__q_w=1e-4, star__sigma_arcsec=3)
+    assert set(Engine(other, other.estimators)._jobs) == set(engine._jobs)
+
+
+def test_unknown_estimators_are_named():
+    experiment, _ = prepared()
+    with pytest.raises(ConfigurationError, match="'eskf' is not allowed: must be of lie_printed, lie"):
+        choose(experiment, ["lie", "eskf"])
+    with pytest.raises(ConfigurationError, match="none given"):
+        choose(experiment, [""])
+    assert choose(experiment, ["mekf", "lie", "lie"]) == ["lie", "mekf"]
+
+
+def test_all_noise_off_gives_finite_summaries(tmp_path):
+    outcome = run(tmp_path, 2, names=None, star__sigma_arcsec=0, gyro__sigma_rad_step=0)
+    text = json.dumps(outcome.summary, allow_nan=False)
+    assert json.loads(text)["estimators"]["lie_tuned"]["rms_over_bound"] == [None, None, None]
+    assert np.isfinite(outcome.dataset["error_rad"].values).all()
+
+
+def test_the_engine_pads_with_the_runs_that_come_next():
+    assert "padded with the runs that would come next" in (engine_module.__doc__ or "")
+    experiment, _ = prepared()
+    engine = Engine(experiment, ["lie"])
+    engine.compile(1)
+    assert engine.compute(1).runs.tolist() == [4, 5, 6, 7]
