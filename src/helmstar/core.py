@@ -95,7 +95,7 @@ class Predicted:
 
 ABSENT, ACCEPTED, GATED, REOPENED, RESET = range(5)
 """Status of an update: no measurement; used; refused by the gate; refused once too often, so that the covariance was
-grown to open the gate again; belief started anew."""
+grown to open the gate again (see `Gate`); belief started anew."""
 
 
 @pytree
@@ -115,8 +115,10 @@ class Info:
 class Gate:
     """Chi-square gate. limits[m] is the largest NIS taken for m degrees of freedom (inf: no gate).
 
-    At the `reopen_after`-th refusal of a sensor in a row, and at each one after it, the belief's covariance grows by
-    NIS over its degrees of freedom (status REOPENED), so that the gate opens for the measurements that follow.
+    The `reopen_after`-th refusal of a sensor in a row makes the belief's covariance grow until it explains the
+    residual (status REOPENED), so that the gate opens for the measurements that follow. Of those, the ones still
+    refused are used all the same (REOPENED again), with their covariance grown likewise: a nonlinear sensor has
+    residuals that no covariance of the state explains, and would never come back from an upset.
     """
 
     limits: Array

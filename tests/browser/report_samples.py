@@ -74,7 +74,7 @@ def _summary(dataset):
     for i, name in enumerate(dataset["estimator"].values):
         error = np.degrees(dataset["error_rad"].values[i])
         with np.errstate(invalid="ignore"):
-            rms = np.sqrt(np.nanmean(np.where(np.isfinite(error), error, np.nan) ** 2, axis=0))
+            rms = np.sqrt(np.mean(error**2, axis=0))
             ratio = rms[-1] / np.degrees(dataset["bound_rad"].values[-1])
         nees = float(np.mean(dataset["nees"].values[i][:, -1]))
         last = str(error.shape[1])

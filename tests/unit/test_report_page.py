@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from helmstar.report.encode import ArrayPool, extremes, pack, sample, script_json, spread
+from helmstar.report.encode import ArrayPool, envelope, extremes, pack, sample, script_json, spread
 from helmstar.report.page import Chip, Column, Page, number
 
 
@@ -52,6 +52,10 @@ def test_thinning_keeps_extremes_ends_and_density():
     assert spread(10, 20).tolist() == list(range(10))
     assert spread(1000, 300)[-1] == 999
     assert extremes(np.full(1000, np.nan), 100).size <= 100
+    index, low, high = envelope(noise, 300)
+    assert len(index) <= 300
+    assert (low.min(), high.max()) == (-30.0, 30.0)
+    assert [len(part) for part in envelope(noise[:7], 300)] == [7, 7, 7]
 
 
 @pytest.mark.parametrize(
@@ -79,7 +83,7 @@ def test_page_escapes_and_has_headers_ids_and_code():
     assert 'id="one-two-2"' in html
     assert '<th scope="col" role="columnheader" class="right">RMS <span class="unit">deg</span></th>' in html
     assert "a&lt;b" in html
-    assert "plotly" not in html  # a page without figures does not carry it
+    assert "plotly.js" not in html  # a page without figures does not carry it
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

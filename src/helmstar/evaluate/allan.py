@@ -22,13 +22,14 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 TERMS = ("quantisation", "arw", "bias_instability", "rrw")
 PENALTY = (8.0, 8.0, 11.0, 8.0)
-"""Deviance that each of TERMS has to earn: about 2.8 sigma. On white noise some 3% of the series are then given a second
-term. The flat floor, which hardly differs from where white noise meets a walk and which no filter uses, earns more."""
+"""Deviance that each of TERMS has to earn: about 2.8 sigma. On white noise some 3% of the series are then given a
+second term. The flat floor, hardly different from where white noise meets a walk and used by no filter, earns more."""
 LEAST_SAMPLES = 50
 FEWEST_PER_TAU = 3
 """The longest tau fits so often into the longest stretch."""
@@ -39,9 +40,9 @@ FLICKER = 2.0 * math.log(2.0) / math.pi
 class AllanCurve:
     """Overlapping Allan deviation of rates: all arrays (t,).
 
-    tau_s; adev in the rates' unit (rad/s), its 1 sigma `error`, `n` squares that were averaged, `edf` equivalent degrees
-    of freedom, `m` samples per tau. `lengths`: samples of each uninterrupted stretch; `period` s. `instant`: samples are
-    values at instants, not means over a period.
+    tau_s; adev in the rates' unit (rad/s), its 1 sigma `error`, `n` squares that were averaged, `edf` equivalent
+    degrees of freedom, `m` samples per tau. `lengths`: samples of each uninterrupted stretch; `period` s. `instant`:
+    samples are values at instants, not means over a period.
     """
 
     tau_s: np.ndarray
@@ -61,8 +62,8 @@ class AllanFit:
 
     arw rad/sqrt(s), rrw rad/s/sqrt(s), bias_instability rad/s, quantisation rad. `model` (t,): the fitted deviation.
     `arw_limit` and `rrw_limit`: what they can be at most (about 2 sigma), whether or not they are in the model.
-    `misfit`: deviance per degree of freedom, near 1 where the model holds; `chance`: how often noise alone gives so much.
-    Where that is below 1e-3 the model is not the whole truth, and the errors are widened by sqrt(misfit).
+    `misfit`: deviance per degree of freedom, near 1 where the model holds; `chance`: how often noise alone gives so
+    much. Where that is below 1e-3 the model is not the whole truth, and the errors are widened by sqrt(misfit).
     """
 
     arw: float | None
@@ -80,13 +81,11 @@ class AllanFit:
     chance: float
 
 
-def allan_deviation(
-    rate: np.ndarray | Sequence[np.ndarray], period: float, *, instant: bool = False
-) -> AllanCurve:
+def allan_deviation(rate: np.ndarray | Sequence[np.ndarray], period: float, *, instant: bool = False) -> AllanCurve:
     """Overlapping Allan deviation at tau = period times 1, 2, 4, ... of one series (n,) or of several stretches of one.
 
-    Stretches are pooled by squares, so none reaches over a gap. Raises ValueError for fewer than LEAST_SAMPLES samples in
-    the longest stretch, a period that is not positive, or samples that are not finite.
+    Stretches are pooled by squares, so none reaches over a gap. Raises ValueError for fewer than LEAST_SAMPLES samples
+    in the longest stretch, a period that is not positive, or samples that are not finite.
     """
     single = isinstance(rate, np.ndarray) and rate.ndim == 1
     stretches = [np.asarray(r, dtype=float) for r in ([rate] if single else rate)]
@@ -101,18 +100,15 @@ def allan_deviation(
 
     count = int(math.log2(longest // FEWEST_PER_TAU)) + 1
     m = 2 ** np.arange(count)
-    stretches = [r for r in stretches if len(r) >= 2]
-    squares = np.zeros(count)
-    n = np.zeros(count)
-    for r in stretches:
-        taus = m[2 * m <= len(r)] * period
-        # The mean says nothing to a second difference, but costs digits in the sum that makes angles of rates. allantools
-        # leaves out a tau that has a single square, and a deviation of zero is one.
-        phase = np.concatenate([[0.0], np.cumsum(r - r.mean())]) * period
-        used, deviation, _, terms = allantools.oadev(phase, rate=1.0 / period, data_type="phase", taus=taus)
-        at = np.searchsorted(m * period * (1.0 + 1e-6), used)
-        squares[at] += terms * deviation**2
-        n[at] += terms
+    squares, n = np.zeros(count), np.zeros(count)
+    for r in (r for r in stretches if len(r) >= 3):
+        # The mean says nothing to a second difference, but costs digits in the sum that makes angles of rates. Time is
+        # counted in samples, so that no rounding touches tau; allantools wants two squares at least.
+        phase = np.concatenate([[0.0], np.cumsum(r - r.mean())])
+        used = int(np.sum(2 * m < len(r)))
+        _, deviation, _, terms = allantools.oadev(phase, rate=1.0, data_type="phase", taus=m[:used].astype(float))
+        squares[:used] += terms * deviation**2
+        n[:used] += terms
     adev = np.sqrt(squares / n)
     lengths = tuple(len(r) for r in stretches)
     edf = _degrees_of_freedom(m, adev, lengths)
@@ -121,8 +117,6 @@ def allan_deviation(
 
 def _degrees_of_freedom(m: np.ndarray, adev: np.ndarray, lengths: tuple[int, ...]) -> np.ndarray:
     """Equivalent degrees of freedom (t,) by Greenhall's formula, for the kind of noise that the local slope shows."""
-    from allantools.ci import edf_greenhall
-
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = np.gradient(np.log(adev), np.log(m))
     bounds = np.array([-0.75, -0.25, 0.25])
@@ -136,21 +130,28 @@ def _degrees_of_freedom(m: np.ndarray, adev: np.ndarray, lengths: tuple[int, ...
             terms = length + 1 - 2 * points
             if terms < 2:
                 continue
-            try:
-                single = edf_greenhall(kind, 2, points, length + 1, overlapping=True)
-            except NotImplementedError:  # white angle noise at tau longer than a third of the record
-                single = edf_greenhall(0, 2, points, length + 1, overlapping=True)
-            spread += many * terms**2 / max(float(single), 1.0)
+            spread += many * terms**2 / _single_degrees_of_freedom(kind, points, length + 1)
             total += many * terms
         edf[i] = total**2 / spread
     return edf
+
+
+@cache
+def _single_degrees_of_freedom(alpha: int, m: int, points: int) -> float:
+    """Of one stretch with so many points of the angle."""
+    from allantools.ci import edf_greenhall
+
+    try:
+        return max(float(edf_greenhall(alpha, 2, m, points, overlapping=True)), 1.0)
+    except NotImplementedError:  # white angle noise at tau longer than a third of the record
+        return max(float(edf_greenhall(0, 2, m, points, overlapping=True)), 1.0)
 
 
 # ----------------------------------------------------------------------------- the fit
 
 
 def _basis(curve: AllanCurve) -> np.ndarray:
-    """Variance (t, 4) of Q^2, N^2, B^2 and K^2 = 1. A walk that is sampled, not averaged, has a little more at short tau."""
+    """Variance (t, 4) of Q^2, N^2, B^2, K^2 = 1. A walk that is sampled, not averaged, has a bit more at short tau."""
     tau, m = curve.tau_s, curve.m.astype(float)
     walk = tau * (2.0 * m**2 + 1.0) / (6.0 * m**2) if curve.instant else tau / 3.0
     return np.stack([3.0 / tau**2, 1.0 / tau, np.full(len(tau), FLICKER), walk], axis=1)
@@ -175,10 +176,10 @@ def fit_allan(curve: AllanCurve) -> AllanFit:
     present = np.flatnonzero(p > 0.0)
     degrees = max(len(variance) - len(present), 1)
     misfit = deviance / degrees
-    from scipy.special import gammaincc
+    from scipy.special import gammaincc, gammaincinv
 
     chance = float(gammaincc(0.5 * degrees, 0.5 * deviance))
-    error = _errors(curve, basis, p * scale, present) * (math.sqrt(misfit) if chance < 1e-3 else 1.0)
+    error = scale * _errors(curve, basis, p, present) * (math.sqrt(misfit) if chance < 1e-3 else 1.0)
     value = np.sqrt(p * scale)
     sigma = error / (2.0 * np.where(value > 0.0, value, 1.0))  # of a root, from that of its square
 
@@ -188,7 +189,7 @@ def fit_allan(curve: AllanCurve) -> AllanFit:
 
     (arw, arw_error), (rrw, rrw_error) = one("arw"), one("rrw")
     (floor, floor_error), (angle, angle_error) = one("bias_instability"), one("quantisation")
-    most = curve.adev + 2.0 * curve.error
+    most = curve.adev * np.sqrt(0.5 * curve.edf / gammaincinv(0.5 * curve.edf, 0.02275))
     return AllanFit(
         arw=arw,
         rrw=rrw,
@@ -239,17 +240,17 @@ def _errors(curve: AllanCurve, basis: np.ndarray, p: np.ndarray, present: np.nda
     normal = (A / size * weight[:, None]).T
     gain = np.linalg.solve(normal @ (A / size), normal) / size[:, None]
     sigma = np.zeros(basis.shape[1])
-    sigma[present] = np.sqrt(np.diag(gain @ variance_covariance(curve, p) @ gain.T))
+    sigma[present] = np.sqrt(np.maximum(np.diag(gain @ variance_covariance(curve, p) @ gain.T), 0.0))
     return sigma
 
 
 def variance_covariance(curve: AllanCurve, squares: np.ndarray) -> np.ndarray:
     """Covariance (t, t) of the Allan variances of Gaussian noise with these squares (Q^2, N^2, B^2, K^2).
 
-    z_a(i) = x(i+2a) - 2x(i+a) + x(i) of the angle x has cross covariance R_ab(k), k = i - j, which is a second difference
-    (twice) of x's generalised autocovariance, Q^2 delta, -N^2 |t|/2, B^2 t^2 ln|t| / (2 pi), K^2 |t|^3 / 12 (Greenhall and
-    Riley 2003); then cov(mean z_a^2, mean z_b^2) = 2 sum_ij R_ab(i-j)^2 / (n_a n_b). Beyond a factor of 32 in tau it is
-    below 1% of the variances' geometric mean and left out.
+    z_a(i) = x(i+2a) - 2x(i+a) + x(i) of the angle x has cross covariance R_ab(k), k = i - j, which is a second
+    difference (twice) of x's generalised autocovariance, Q^2 delta, -N^2 |t|/2, B^2 t^2 ln|t| / (2 pi), K^2 |t|^3 / 12
+    (Greenhall and Riley 2003); then cov(mean z_a^2, mean z_b^2) = 2 sum_ij R_ab(i-j)^2 / (n_a n_b). Beyond a factor of
+    32 in tau it is below 1% of the variances' geometric mean and left out.
     """
     dt, lengths = curve.period, np.unique(curve.lengths, return_counts=True)
     m, count = curve.m.tolist(), curve.n
@@ -263,9 +264,7 @@ def variance_covariance(curve: AllanCurve, squares: np.ndarray) -> np.ndarray:
     return result
 
 
-def _sum_of_squares(
-    a: int, b: int, squares: np.ndarray, dt: float, lengths: tuple[np.ndarray, np.ndarray]
-) -> float:
+def _sum_of_squares(a: int, b: int, squares: np.ndarray, dt: float, lengths: tuple[np.ndarray, np.ndarray]) -> float:
     """sum_ij R_ab(i - j)^2 over all squares of all stretches; a <= b."""
     jumps = [(i * a - j * b, c * d) for i, c in enumerate((1, -2, 1)) for j, d in enumerate((1, -2, 1))]
     q, n, flicker, k = squares

@@ -73,21 +73,46 @@ def prepare(sensor: Sensor, x: Any, m: Measurement) -> tuple[Array, Array, Array
     return e, rows, R
 
 
-def judge(e: Array, S: Array, rows: Array, gate: Gate, refused: Array) -> tuple[Array, Array, Array, Array]:
-    """Of a residual e with covariance S: whitening V (lower, V S V^T = I), NIS, degrees of freedom and status."""
+def judge(
+    e: Array, S: Array, rows: Array, gate: Gate, refused: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Of a residual e with covariance S: whitening V (lower, V S V^T = I), NIS, degrees of freedom, status and whether
+    the update is made. A NIS that is not finite (S singular, a residual of NaN) is refused and reopens nothing.
+
+    Raises ValueError (when traced) for more residuals than the gate has limits for.
+    """
+    if e.shape[-1] >= gate.limits.shape[-1]:
+        raise ValueError(
+            f"{e.shape[-1]} residuals, but the gate has limits for {gate.limits.shape[-1] - 1}: build it with "
+            f"max_dof={e.shape[-1]} or more"
+        )
     V = small.invert_lower(small.cholesky(S))
     white = small.matvec(V, e)
     nis = jnp.sum(white * white)
     dof = jnp.sum(rows)
-    status = jnp.where(refused + 1 >= gate.reopen_after, REOPENED, GATED)
+    status = jnp.where((refused + 1 >= gate.reopen_after) & jnp.isfinite(nis), REOPENED, GATED)
     status = jnp.where(nis <= gate.limits[dof], ACCEPTED, status)
-    return V, nis, dof, jnp.where(dof > 0, status, ABSENT)
+    status = jnp.where(dof > 0, status, ABSENT)
+    used = (status == ACCEPTED) | ((status == REOPENED) & (refused >= gate.reopen_after))
+    return V, nis, dof, status, used
 
 
-def grow(cov: Array, nis: Array, dof: Array, status: Array) -> Array:
-    """A belief whose measurements were refused again and again was too sure of itself: its covariance grows by what
-    NIS exceeds its expectation, so that the gate opens for the measurements that follow."""
-    return jnp.where(status == REOPENED, cov * (nis / jnp.maximum(dof, 1)), cov)
+def grow(cov: Array, nis: Array, R: Array, S: Array, status: Array, used: Array) -> Array:
+    """A belief whose measurements were refused again and again was too sure of itself: its covariance grows by NIS over
+    the degrees of freedom that it explains, sum(1 - R_ii / S_ii), so that the gate opens for the measurements that follow."""
+    explained = jnp.sum(1.0 - jnp.diagonal(R) / jnp.diagonal(S))
+    factor = jnp.maximum(nis / jnp.maximum(explained, jnp.finfo(cov.dtype).eps), 1.0)
+    return jnp.where((status == REOPENED) & ~used, cov * factor, cov)
+
+
+def doubt(R: Array, nis: Array, dof: Array, status: Array) -> Array:
+    """R of a measurement that is used although the gate would refuse it: NIS / dof times larger, where P+ is computed.
+
+    Far outside the linear range of h a residual has parts that no covariance of the state explains (stars off by 90 deg
+    do not look like any small turn): waiting for a grown covariance to open the gate would be waiting for ever. The gain is
+    the one of R itself, a Gauss-Newton step towards the measurement.
+    """
+    return R * jnp.where(status == REOPENED, nis / jnp.maximum(dof, 1), jnp.ones_like(nis))
 
 
 def gain(V: Array, HP: Array) -> Array:
@@ -137,7 +162,8 @@ class ErrorStateKalmanFilter:
         H = self._sensor_jacobian(sensor, x, m, rows, d)
         HP = small.matmul(H, P)
         S = small.matmul(HP, small.transpose(H)) + R
-        V, nis, dof, status = judge(e, S, rows, gate, refused)
+        V, nis, dof, status, used = judge(e, S, rows, gate, refused)
+        P_grown = grow(P, nis, R, S, status, used)
         info = information(e, S, V, rows, nis, dof, status)
         K = gain(V, HP)
         d = small.matvec(K, e)
@@ -150,13 +176,11 @@ class ErrorStateKalmanFilter:
             K = gain(V, HP)
             d = small.matvec(K, e_i + small.matvec(H, d))
 
-        used = status == ACCEPTED
         d = jnp.where(used, d, jnp.zeros_like(d))
         K = jnp.where(used, K, jnp.zeros_like(K))
         A = jnp.eye(r.dim, dtype=P.dtype) - small.matmul(K, H)
-        cov = small.congruence(A, P) + small.congruence(K, R)
-        cov = carry_covariance(r, self.carry, x, d, cov)
-        return Gaussian(r.boxplus(x, d), grow(cov, nis, dof, status)), info
+        cov = small.congruence(A, P_grown) + small.congruence(K, doubt(R, nis, dof, status))
+        return Gaussian(r.boxplus(x, d), carry_covariance(r, self.carry, x, d, cov)), info
 
     def _sensor_jacobian(self, sensor: Sensor, x: Any, m: Measurement, rows: Array, d: Array) -> Array:
         """H = d h(x [+] d)/d d with the rows of absent entries zero."""

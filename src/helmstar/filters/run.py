@@ -35,7 +35,7 @@ def step(
         kept = jnp.where(info.status == ABSENT, refused[i], refused[i] + 1)
         counts.append(jnp.where(info.status == ACCEPTED, 0, kept))
         infos.append(info)
-    return belief, jnp.stack(counts), predicted, tuple(infos)
+    return belief, jnp.stack(counts) if counts else refused, predicted, tuple(infos)
 
 
 @partial(jax.jit, static_argnames=("filter", "keep"))

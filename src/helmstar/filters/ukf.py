@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..backend import jax, jnp
-from ..core import ACCEPTED, Gate, Gaussian, Info, Measurement, Predicted, Process, Sensor, pytree
+from ..core import Gate, Gaussian, Info, Measurement, Predicted, Process, Sensor, pytree
 from ..geometry import small
 from ..geometry.retraction import Retraction
-from .ekf import Carry, carry_covariance, gain, grow, information, judge, prepare
+from .ekf import Carry, carry_covariance, doubt, gain, grow, information, judge, prepare
 
 Array = jax.Array
 
@@ -123,15 +123,14 @@ class UnscentedKalmanFilter:
         S = _weighted_outer(w, dev, dev) + centre_cov * dev_0[:, None] * dev_0[None, :] + R
         Pzx = _weighted_outer(w, dev, xi)
         e = e - dz_mean
-        V, nis, dof, status = judge(e, S, rows, gate, refused)
+        V, nis, dof, status, used = judge(e, S, rows, gate, refused)
         info = information(e, S, V, rows, nis, dof, status)
-        used = status == ACCEPTED
         K = gain(V, Pzx)
         K = jnp.where(used, K, jnp.zeros_like(K))
         d = jnp.where(used, small.matvec(K, e), jnp.zeros(r.dim, P.dtype))
-        cov = P - small.congruence(K, S)
+        cov = grow(P, nis, R, S, status, used) - small.congruence(K, S + R - doubt(R, nis, dof, status))
         cov = small.symmetrise(carry_covariance(r, self.carry, x, d, cov))
-        return UnscentedBelief(r.boxplus(x, d), grow(cov, nis, dof, status), belief.spread), info
+        return UnscentedBelief(r.boxplus(x, d), cov, belief.spread), info
 
 
 def _root(Q: Array) -> Array:

@@ -100,7 +100,7 @@ def inverse_spd(A: Array) -> Array:
     """A^-1 for symmetric positive definite A (..., n, n), symmetric to the bit."""
     n = A.shape[-1]
     V = solve_lower(cholesky(A), jnp.broadcast_to(jnp.eye(n, dtype=A.dtype), A.shape))
-    return transpose(V) @ V
+    return matmul(transpose(V), V)  # not `@`, which blocks the sums and is symmetric only up to size 8
 
 
 @jax.jit

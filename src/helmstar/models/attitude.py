@@ -63,7 +63,7 @@ def _attitude_step(params: GyroNoise, q: Array, u: GyroInput, dt: Array, w: Arra
 
 
 def _attitude_noise(params: GyroNoise, q: Array, u: GyroInput, dt: Array) -> Array:
-    return params.sigma_v**2 * dt * jnp.eye(3) + u.extra
+    return params.sigma_v**2 * dt * jnp.eye(3, dtype=q.dtype) + u.extra
 
 
 def _attitude_jacobian(params: GyroNoise, q: Array, u: GyroInput, dt: Array) -> tuple[Array, None]:
@@ -76,7 +76,7 @@ def _drift_step(params: GyroNoise, x: AttitudeDrift, u: GyroInput, dt: Array, w:
 
 
 def _drift_noise(params: GyroNoise, x: AttitudeDrift, u: GyroInput, dt: Array) -> Array:
-    v2, u2, eye = params.sigma_v**2, params.sigma_u**2, jnp.eye(3)
+    v2, u2, eye = params.sigma_v**2, params.sigma_u**2, jnp.eye(3, dtype=x.b.dtype)
     aa, ab, bb = (v2 * dt + u2 * dt**3 / 3.0) * eye + u.extra, (0.5 * u2 * dt**2) * eye, (u2 * dt) * eye
     return small.blocks([[aa, ab], [ab, bb]])
 

@@ -41,7 +41,7 @@ def _stars_minus(z: Array, z_hat: Array) -> Array:
 
 
 def _stars_cov(params: StarNoise, x: Any, r_N: Array) -> Array:
-    return params.sigma**2 * jnp.eye(r_N.shape[0] * 3)
+    return params.sigma**2 * jnp.eye(r_N.shape[0] * 3, dtype=r_N.dtype)
 
 
 def _pad(H: Array, x: Any) -> Array:
@@ -101,7 +101,7 @@ def _unit_minus(z: Array, z_hat: Array) -> Array:
 
 
 def _unit_cov(params: StarNoise, x: Any, r_N: Array) -> Array:
-    return params.sigma**2 * jnp.eye(r_N.shape[0] * 2)
+    return params.sigma**2 * jnp.eye(r_N.shape[0] * 2, dtype=r_N.dtype)
 
 
 def _unit_left(params: StarNoise, x: Any, r_N: Array) -> Array:

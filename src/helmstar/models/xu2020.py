@@ -43,7 +43,7 @@ def _step(params: Tuning, q: Array, u: Array, dt: Array, w: Array) -> Array:
 
 
 def _noise(params: Tuning, q: Array, u: Array, dt: Array) -> Array:
-    return params.q_w * jnp.eye(3)
+    return params.q_w * jnp.eye(3, dtype=q.dtype)
 
 
 def _jacobian_right(params: Tuning, q: Array, u: Array, dt: Array) -> tuple[Array, None]:
@@ -64,7 +64,7 @@ def _step_additive(params: Tuning, q: Array, u: Array, dt: Array, w: Array) -> A
 
 
 def _noise_additive(params: Tuning, q: Array, u: Array, dt: Array) -> Array:
-    return params.q_w * jnp.eye(4)
+    return params.q_w * jnp.eye(4, dtype=q.dtype)
 
 
 def _jacobian_additive(params: Tuning, q: Array, u: Array, dt: Array) -> tuple[Array, None]:

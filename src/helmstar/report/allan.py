@@ -108,10 +108,7 @@ def _slopes(name: str, found: Mapping[str, Any], tau: np.ndarray, colour: str) -
     if floor:
         parts.append(np.full(2, MINIMUM * floor))
     label = f"{name} slopes"
-    return [
-        line(ends, values, label, colour, width=1, dash="dot", **({"showlegend": False} if j else {}))
-        for j, values in enumerate(parts)
-    ]
+    return [line(ends, values, label, colour, width=1, dash="dot", showlegend=j == 0) for j, values in enumerate(parts)]
 
 
 def _limits(axes: Mapping[str, Mapping[str, Any]], key: str) -> list[float] | None:

@@ -65,7 +65,7 @@ class Campaign:
             names=names,
             update=np.asarray(update, dtype=float),
             run_ids=np.asarray(dataset["run"].values) if "run" in dataset.coords else np.arange(runs),
-            errors={name: np.degrees(value) for name, value in by_estimator("error_rad", "axis").items()},
+            errors={name: np.degrees(_finite(value)) for name, value in by_estimator("error_rad", "axis").items()},
             sigmas={name: np.degrees(value) for name, value in by_estimator("sigma_rad", "axis").items()},
             nees=by_estimator("nees"),
             nis=by_estimator("nis"),

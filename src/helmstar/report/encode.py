@@ -82,6 +82,18 @@ def spread(count: int, most: int, dense_start: int = 100) -> np.ndarray:
     return np.unique(np.concatenate([np.arange(start), np.round(rest).astype(int)]))
 
 
+def envelope(values: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(index, lowest, highest) of at most `most` stretches of a series that swings faster than a plot can show."""
+    width = max(-(-len(values) // most), 1)
+    padded = np.full(-(-len(values) // width) * width, np.nan)
+    padded[: len(values)] = np.where(np.isfinite(values), values, np.nan)
+    blocks = padded.reshape(-1, width)
+    low = np.min(np.where(np.isnan(blocks), np.inf, blocks), axis=1)
+    high = np.max(np.where(np.isnan(blocks), -np.inf, blocks), axis=1)
+    index = np.minimum(np.arange(len(blocks)) * width + width // 2, len(values) - 1)
+    return index, np.where(np.isfinite(low), low, np.nan), np.where(np.isfinite(high), high, np.nan)
+
+
 def sample(values: np.ndarray, most: int) -> np.ndarray:
     """At most `most` indices for a cloud of points: evenly spread, so that its density is true, and its outliers."""
     if len(values) <= most:

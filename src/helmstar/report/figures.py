@@ -94,9 +94,8 @@ def error_total(
     hover = "update %{x}<br>%{y:.4g} deg"
     traces = band(update, low, high, "5% to 95% of runs", colour, 0.28) if several else []
     for j, (run, (at, values)) in enumerate(singles.items()):
-        more = {"showlegend": False} if j else {}
         label = "single runs" if several else run
-        traces.append(line(at, values, label, style.GREY, width=0.8, opacity=0.75, **more))
+        traces.append(line(at, values, label, style.GREY, width=0.8, opacity=0.75, showlegend=j == 0))
     if several:
         traces.append(line(update, median, "median", colour, width=2.2, hover=hover))
     traces.append(line(update, sigma, "99.7% by the filter", style.AMBER, dash="dot", hover=hover))

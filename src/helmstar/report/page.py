@@ -235,7 +235,7 @@ class Page:
         return script_json({"arrays": self._pool.entries, "figures": self._figures})
 
 
-def number(value: float | int | None, digits: int = 3) -> str:
+def number(value: Any, digits: int = 3) -> str:
     """A number for people: 0.0031, 12 345, 3.5×10⁻⁶; a dash where there is none."""
     if value is None or not np.isfinite(value):
         return "–"

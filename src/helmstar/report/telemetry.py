@@ -98,8 +98,8 @@ def _add_drift_table(page: Page, result: dict[str, Any]) -> None:
     drift, sigma = result.get("drift_arcsec_s"), result.get("drift_sigma_arcsec_s") or [None] * 3
     mean, limits = result.get("nis_mean"), result.get("nis_band")
     if drift:
-        rows = [[name, drift[i], sigma[i]] for i, name in enumerate("xyz")]
-        columns = [Column("Axis of B", align="left"), Column("Drift", "arcsec/s", digits=7)]
+        rows = [[name, _fixed(drift[i]), sigma[i]] for i, name in enumerate("xyz")]
+        columns = [Column("Axis of B", align="left"), Column("Drift", "arcsec/s")]
         page.table([*columns, Column("1σ", "arcsec/s", digits=2)], rows, caption="Gyro drift at the end of the series.")
     if mean is not None and limits:
         if mean > limits[1]:
@@ -135,7 +135,7 @@ def _add_figures(page: Page, result: dict[str, Any], frames: Mapping[str, pandas
             [
                 Figure(
                     figures.attitude_sigma(states, clock, gaps),
-                    f"How well the filter says it knows the attitude: gaps raise the curve, smoothing lowers it.{grey}",
+                    f"How well the filter says it knows the attitude; shaded: its swing between measurements.{grey}",
                     "One sigma of the attitude per axis in arcseconds over time, filtered and smoothed, logarithmic.",
                 ),
                 Figure(

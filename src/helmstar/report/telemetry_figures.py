@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from . import style
-from .encode import extremes, sample, spread
+from .encode import envelope, extremes, sample, spread
 from .style import axis, band, layout, line, on, stacked
 
 AXES = ("x", "y", "z")
-SMOOTH, NOISY, MARKS = 1500, 3000, 4000
+SMOOTH, NOISY, MARKS, SWINGS = 1500, 3000, 4000, 100
 REFUSED = 2000  # at most so many refused rows are marked
 GAPS = 200  # and so many gaps, the longest
 
@@ -92,20 +92,23 @@ def drift(frames: Mapping[str, Any], clock: Clock, shapes: list[dict[str, Any]])
 
 
 def attitude_sigma(frames: Mapping[str, Any], clock: Clock, shapes: list[dict[str, Any]]) -> dict[str, Any]:
-    """1 sigma of the attitude per axis over time, filtered dashed and smoothed solid, logarithmic."""
-    traces = []
+    """1 sigma of the attitude per axis over time, logarithmic: the line is the largest of a stretch, shaded the rest.
+
+    Sigma grows between two star measurements and falls at each, thousands of times in a series.
+    """
+    traces: list[dict[str, Any]] = []
     shown = []
     for kind, dash in (("filtered", "dot"), ("smoothed", "solid")):
         if kind not in frames:
             continue
         time = clock(_column(frames[kind], "time_s"))
         for i, name in enumerate(AXES):
-            sigma = _column(frames[kind], f"sigma_attitude_{name}_arcsec")
-            index = extremes(sigma, SMOOTH)
-            shown.append(sigma[index])
-            hover = f"%{{x:.5g}} {clock.unit}<br>%{{y:.4g}} arcsec"
-            colour = style.AXIS_COLOURS[i]
-            traces.append(line(time[index], sigma[index], f"{name} {kind}", colour, width=1.5, dash=dash, hover=hover))
+            index, low, high = envelope(_column(frames[kind], f"sigma_attitude_{name}_arcsec"), SWINGS)
+            shown += [low, high]
+            label, colour = f"{name} {kind}", style.AXIS_COLOURS[i]
+            hover = f"%{{x:.5g}} {clock.unit}<br>up to %{{y:.4g}} arcsec"
+            traces += band(time[index], low, high, label, colour, 0.15, showlegend=False)
+            traces.append(line(time[index], high, label, colour, width=1.5, dash=dash, hover=hover))
     y_axis = style.log_axis("Attitude sigma (arcsec)", *shown)
     return {"data": traces, "layout": layout(shapes=shapes, xaxis=axis(clock.title), yaxis=y_axis)}
 
@@ -128,13 +131,12 @@ def residuals(updates: Any, clock: Clock, shapes: list[dict[str, Any]]) -> dict[
         unit = "arcsec"
         traces.append(_marks(time[rows], value[rows], "accepted", style.BLUE, "circle", 3, unit, clock, place))
         traces += _refused(time, value, status, unit, clock, place)
-        limits = style.nice_limit(value[used], 3 * sigma[used])
+        usual = sigma[used & np.isfinite(sigma)]
+        limits = style.nice_limit(value[used], 3 * np.median(usual) if usual.size else 0.0)
         if limits:
             views["Used rows"]["yaxis" + ("" if i == 0 else str(i + 1)) + ".range"] = [-limits, limits]
     axes = stacked(3, [f"{name} (arcsec)" for name in AXES], clock.title, gap=0.04)
-    refused = bool((~used).any())
-    meta = {"views": {**views, "All rows": {}} if refused else views}
-    return {"data": traces, "layout": layout(meta, shapes=shapes, **axes)}
+    return {"data": traces, "layout": layout({"views": {**views, "Whole": {}}}, shapes=shapes, **axes)}
 
 
 def nis(updates: Any, clock: Clock, shapes: list[dict[str, Any]], gate: np.ndarray | None) -> dict[str, Any]:

@@ -1,8 +1,9 @@
 """`helmstar allan`: from gyro rows, at rest or in flight, to Allan deviation, noise parameters and a [gyro] table.
 
-A rate in flight holds motion. Where the telemetry has attitudes, what is analysed is the gyro's turn between attitudes minus
-theirs, whose noise then shows as white noise of the angle (quantisation); else the rates themselves, with a warning where
-they clearly move. Missing single rows are filled; longer gaps split the record into stretches, which are pooled.
+A rate in flight holds motion. Where the telemetry has attitudes, what is analysed is the gyro's turn between attitudes
+minus theirs, whose noise then shows as white noise of the angle (quantisation); else the rates themselves, with a
+warning where they clearly move. Missing single rows are filled; longer gaps split the record into stretches, which
+are pooled.
 """
 
 from __future__ import annotations
@@ -21,14 +22,25 @@ from ..evaluate.allan import LEAST_SAMPLES, AllanCurve, AllanFit, allan_deviatio
 from ..io.problems import Problem, refuse
 from ..io.screening import GAP_FACTOR, find_gaps, screen_gyro
 from ..io.telemetry import AttitudeRows, GyroRows, Telemetry, read_telemetry, to_rates
-from ..sensors.configuration import ARCSEC, ARW_UNITS, BIAS_INSTABILITY_UNITS, RRW_UNITS, SensorsConfiguration, load_sensors
+from ..sensors.configuration import (
+    ARCSEC,
+    ARW_UNITS,
+    BIAS_INSTABILITY_UNITS,
+    RRW_UNITS,
+    SensorsConfiguration,
+    load_sensors,
+)
 from ..versions import versions
 from .rates import rate_signal
 
 JITTER = 0.2  # of a period; within it samples count as regular
+ODD_STEPS = 0.01  # so few steps that fit no period split the record; with more of them it has no period
 MUCH_FILLED = 0.02
-COARSER = 8  # an irregular series is resampled at so many median steps: interpolating smooths 1/16 of the variance there
+COARSER = (
+    8  # an irregular series is resampled at so many median steps, where interpolating smooths 1/16 of the variance
+)
 ATTITUDE_JUMP = 12.0  # robust sigmas, to and fro, of an attitude that is wrong by itself
+JUMPS_ARE_RARE = 0.02  # more of them are the nature of the data
 MOTION_SPREAD = 3.0
 
 
@@ -64,8 +76,8 @@ def regular_series(
 ) -> Series:
     """Rates (n, 3) at increasing times (n,) at a constant period.
 
-    `covered` (n,) s: what each mean rate covers up to its time (NaN: since the row before); None if the rates are values at
-    instants. Raises DataError where no stretch between gaps has `least` samples.
+    `covered` (n,) s: what each mean rate covers up to its time (NaN: since the row before); None if the rates are
+    values at instants. Raises DataError where no stretch between gaps has `least` samples.
     """
     step = np.diff(time)
     if len(time) < least:
@@ -74,20 +86,20 @@ def regular_series(
             "random walk thousands. Give a longer record"
         )
     period = float(np.median(step))
-    edges = np.flatnonzero(step > GAP_FACTOR * period) + 1
-    pieces = [p for p in np.split(np.arange(len(time)), edges) if len(p) >= 2]
+    count = np.maximum(np.rint(step / period), 1.0)
+    gap = step > GAP_FACTOR * period
+    odd = ~gap & (np.abs(step / period - count) > JITTER)
+    regular = odd.sum() <= ODD_STEPS * len(step)
+    pieces = np.split(np.arange(len(time)), np.flatnonzero(gap | odd if regular else gap) + 1)
+    pieces = [p for p in pieces if len(p) >= 2]
     how, warnings, filled = [], [], 0
-    places = []
-    for piece in pieces:
-        steps = np.diff(time[piece]) / period
-        count = np.maximum(np.rint(steps), 1.0)
-        places.append((count, np.abs(steps - count).max() <= JITTER))
-    if all(good for _, good in places):
+    if regular:
+        places = [count[p[:-1]] for p in pieces]
         span = sum(time[p[-1]] - time[p[0]] for p in pieces)
-        period = float(span / sum(c.sum() for c, _ in places))
+        period = float(span / sum(c.sum() for c in places))
         stretches = []
-        for piece, (count, _) in zip(pieces, places):
-            at = np.concatenate([[0], np.cumsum(count)]).astype(int)
+        for piece, counts in zip(pieces, places):
+            at = np.concatenate([[0], np.cumsum(counts)]).astype(int)
             whole = np.arange(at[-1] + 1)
             values = np.stack([np.interp(whole, at, rate[piece, i]) for i in range(3)], axis=1)
             if covered is not None:  # a mean over several periods is the mean in each of them
@@ -97,21 +109,23 @@ def regular_series(
                 values = np.where(long[after][:, None], rate[piece][after], values)
             filled += len(whole) - len(piece)
             stretches.append(values)
-        jitter = max(float(np.abs(np.diff(time[p]) / period - c).max()) for p, (c, _) in zip(pieces, places))
+        jitter = max(float(np.abs(np.diff(time[p]) / period - c).max()) for p, c in zip(pieces, places))
         how.append(f"regular: steps within {100 * jitter:.2g}% of the period")
+        if odd.any():
+            how.append(f"split at {int(odd.sum())} steps that are no multiple of the period, as at gaps")
         if filled:
             total = sum(len(s) for s in stretches)
             how.append(f"{filled} missing rows filled")
             if filled > MUCH_FILLED * total:
                 warnings.append(
-                    f"{filled} of {total} samples were missing and filled by interpolation: the shortest tau come out low"
+                    f"{filled} of {total} samples were missing and filled from others: the shortest tau come out low"
                 )
     else:
         period *= COARSER
-        stretches = [_resample(time[p], rate[p], None if covered is None else covered[p], period) for p in pieces]
+        stretches = [_resample(time[p], rate[p], covered is None, period) for p in pieces]
         message = (
-            f"the rows are not at a constant period: resampled to {period:.6g} s by linear interpolation of the integrated "
-            "rate, which makes the shortest tau, and the angle random walk with it, up to 3% low"
+            f"the rows are not at a constant period: resampled to {period:.6g} s by linear interpolation of the "
+            "integrated rate, which makes the shortest tau, and the angle random walk with it, up to 3% low"
         )
         how.append(message)
         warnings.append(message)
@@ -119,20 +133,21 @@ def regular_series(
     longest = max((len(s) for s in used), default=0)
     if longest < least:
         raise DataError(
-            f"{file}: the longest stretch without a gap has {longest} samples at a period of {period:.6g} s; at least {least} "
-            "are needed. Give a longer record, or one with fewer gaps (a gap is longer than 3 median steps)"
+            f"{file}: the longest stretch without a gap has {longest} samples at a period of {period:.6g} s; at least "
+            f"{least} are needed. Give a longer record, or one with fewer gaps (a gap is longer than 3 median steps)"
         )
     if len(stretches) > 1:
-        how.append(f"{len(used)} stretches between gaps pooled by squares, {longest} samples in the longest")
-    return Series(used, period, covered is None and period < COARSER * float(np.median(step)), how, warnings)
+        how.append(f"{len(used)} uninterrupted stretches pooled by squares, {longest} samples in the longest")
+    return Series(used, period, covered is None and regular, how, warnings)
 
 
-def _resample(time: np.ndarray, rate: np.ndarray, covered: np.ndarray | None, period: float) -> np.ndarray:
+def _resample(time: np.ndarray, rate: np.ndarray, instant: bool, period: float) -> np.ndarray:
     """Mean rates (k, 3) over periods from the first row on, from the linearly interpolated integral."""
-    mean = 0.5 * (rate[1:] + rate[:-1]) if covered is None else rate[1:]
+    mean = 0.5 * (rate[1:] + rate[:-1]) if instant else rate[1:]
     angle = np.concatenate([np.zeros((1, 3)), np.cumsum(mean * np.diff(time)[:, None], axis=0)])
     grid = time[0] + period * np.arange(int((time[-1] - time[0]) / period) + 1)
-    return np.diff(np.stack([np.interp(grid, time, angle[:, i]) for i in range(3)], axis=1), axis=0) / period
+    on_grid = np.stack([np.interp(grid, time, angle[:, i]) for i in range(3)], axis=1)
+    return (on_grid[1:] - on_grid[:-1]) / period
 
 
 # ----------------------------------------------------------------------------- gyro minus attitude
@@ -199,14 +214,17 @@ def _jumps(start: np.ndarray, angle: np.ndarray, count: int) -> np.ndarray:
     if len(start) < 7:
         return jump
     off = angle - np.median(angle, axis=0)
-    sigma = 1.4826 * np.median(np.abs(off), axis=0)
+    size = np.abs(off)
+    sigma = np.maximum(np.median(size, axis=0) / 0.6745, np.quantile(size, 0.9, axis=0) / 1.6449)
     limit = ATTITUDE_JUMP * np.maximum(sigma, 1e-15)
     neighbours = np.diff(start) == 1
     before, after = off[:-1], off[1:]
     to_and_fro = (np.abs(before) > limit) & (np.abs(after) > limit) & (before * after < 0.0)
     to_and_fro &= np.abs(before + after) < 0.5 * np.abs(before)
+    calm = np.abs(off) < 0.5 * limit  # before and after it; else it is the data's nature here
+    to_and_fro[1:-1] &= calm[:-3] & calm[3:]
     jump[start[1:][to_and_fro.any(axis=1) & neighbours]] = True
-    return jump
+    return jump if jump.mean() <= JUMPS_ARE_RARE else np.zeros(count, dtype=bool)
 
 
 # ----------------------------------------------------------------------------- from series to parameters
@@ -218,12 +236,12 @@ def analyse(series: Series, file: str) -> dict[str, Axis]:
     for i, name in enumerate("xyz"):
         curve = allan_deviation([s[:, i] for s in series.stretches], series.period, instant=series.instant)
         size = max(float(np.abs(s[:, i]).max()) for s in series.stretches)
-        varies = bool((curve.adev > 1e-13 * size).all() and (curve.adev > 0.0).all())
+        varies = bool((curve.adev > max(1e-13 * size, 1e-100)).all())
         axes[name] = Axis(curve, fit_allan(curve) if varies else None)
     if all(axis.fit is None for axis in axes.values()):
         raise DataError(
-            f"{file}: the gyro rates do not vary at all, so there is no noise to see; give raw rates, neither simulated "
-            "without noise nor rounded"
+            f"{file}: the gyro rates do not vary at all, so there is no noise to see; give raw rates, neither "
+            "simulated without noise nor rounded"
         )
     return axes
 
@@ -237,16 +255,17 @@ def signs_of_motion(series: Series, axes: dict[str, Axis]) -> list[str]:
         if fit is None:
             continue
         T, dt = len(longest) * series.period, series.period
-        expected = (fit.arw or 0.0) ** 2 / dt + (fit.rrw or 0.0) ** 2 * T / 6.0 + 2.0 * (fit.quantisation or 0.0) ** 2 / dt**2
+        expected = (fit.arw or 0.0) ** 2 / dt + (fit.rrw or 0.0) ** 2 * T / 6.0
+        expected += 2.0 * ((fit.quantisation or 0.0) / dt) ** 2
         expected += (fit.bias_instability or 0.0) ** 2 * math.log(max(len(longest), 2)) / math.pi
-        spread = float(np.std(longest[:, i]))
+        spread = float(np.std(longest[:, i])) / math.sqrt(expected)
         red = (fit.rrw or 0.0) ** 2 * dt / 3.0 + 0.44 * (fit.bias_instability or 0.0) ** 2
         if fit.chance < 1e-3:
             found.append(
                 f"axis {name}: the curve is not that of gyro noise (misfit {fit.misfit:.3g}, chance {fit.chance:.1g})"
             )
-        if spread > MOTION_SPREAD * math.sqrt(expected):
-            found.append(f"axis {name}: the rate spreads {spread / math.sqrt(expected):.3g} times as far as the fitted noise")
+        if spread > MOTION_SPREAD:
+            found.append(f"axis {name}: the rate spreads {spread:.3g} times as far as the fitted noise")
         if red > 0.5 * float(axis.curve.adev[0]) ** 2:
             found.append(f"axis {name}: even from sample to sample slow changes rule, not white noise")
     return found
@@ -269,10 +288,12 @@ def run_allan(
     warnings += [f"axis {n}: the rates do not vary; it is left out" for n, axis in axes.items() if axis.fit is None]
     motion = signs_of_motion(series, axes)
     if motion and basis == "gyro":
-        motion.append("the rates hold motion of the body, or more than the modelled noise: the parameters are at most right at "
-                      "the shortest tau; use a record at rest, or give attitudes beside the gyro")  # fmt: skip
+        motion.append(
+            "the rates hold motion of the body, or more than the modelled noise: the parameters are at most right at "
+            "the shortest tau; use a record at rest, or give attitudes beside the gyro"
+        )
     elif motion:
-        motion.append("gyro and attitudes differ by more than the modelled noise (scale factor, timing, correlated noise)")
+        motion.append("gyro and attitudes differ by more than the modelled noise (scale, timing, correlated noise)")
     result = _result(series, axes, basis, warnings + motion)
     zero = 0.0 if telemetry.origin.absolute else telemetry.origin.second
     result |= {
@@ -413,7 +434,8 @@ def _sensors_toml(result: dict[str, Any], sensors: SensorsConfiguration) -> str:
         arw = text(axis["arw_arcsec_sqrt_s"], axis["arw_error_arcsec_sqrt_s"], axis["arw_limit_arcsec_sqrt_s"])
         rrw = text(axis["rrw_arcsec_s_sqrt_s"], axis["rrw_error_arcsec_s_sqrt_s"], axis["rrw_limit_arcsec_s_sqrt_s"])
         floor = text(axis["bias_instability_arcsec_s"], axis["bias_instability_error_arcsec_s"])
-        lines.append(f"# {name}: arw {arw} arcsec/sqrt(s); rrw {rrw} arcsec/s/sqrt(s); bias instability {floor} arcsec/s")
+        lines.append(f"# {name}: arw {arw} arcsec/sqrt(s); rrw {rrw} arcsec/s/sqrt(s)")
+        lines.append(f"#    bias instability {floor}{'' if floor == 'not seen' else ' arcsec/s'}")
     lines.append("# below: root mean square over the axes that show it")
     lines.append("[gyro]")
     if sensors.gyro.reading != "instant":
