@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-
 from problem import DT, P0, SIGMA, SIGMA_U, SIGMA_V, Problem
 
 SOURCE = Path(__file__).with_name("mekf.c")

@@ -14,8 +14,8 @@ import os
 # time). Parallelism is over blocks of runs instead, one Python thread each. XLA reads NPROC when its client starts.
 os.environ.setdefault("NPROC", "1")
 
-import jax  # noqa: E402  (the variable above must come first)
-import jax.numpy as jnp  # noqa: E402
+import jax
+import jax.numpy as jnp
 
 jax.config.update("jax_enable_x64", True)
 
@@ -24,7 +24,7 @@ def _enable_compilation_cache() -> None:
     """Keep every compiled program, however fast it compiled: a filter is many small programs."""
     folder = os.environ.get("HELMSTAR_CACHE_DIR")
     if folder is None:
-        if jax.config.jax_compilation_cache_dir:
+        if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
             return
         from platformdirs import user_cache_dir
 

@@ -89,7 +89,9 @@ They may stand in one table or in two; other layouts are mapped by [columns] in 
         formatter_class=raw,
     )
     c.add_argument("files", nargs="+", metavar="FILE", help="CSV or Parquet tables")
-    c.add_argument("--config", metavar="TOML", help="sensors.toml: columns, noise, mounting, gate (see docs/telemetry.md)")
+    c.add_argument(
+        "--config", metavar="TOML", help="sensors.toml: columns, noise, mounting, gate (see docs/telemetry.md)"
+    )
     c.add_argument("--strict", action="store_true", help="a bad row is an error instead of being dropped and reported")
     c.add_argument("--csv", action="store_true", help="write tables as CSV instead of Parquet")
     _common(c, "helmstar-out/attitude-FILE")

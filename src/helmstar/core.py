@@ -7,9 +7,9 @@ is compiled); parameters are data (a new tuning never compiles again). Any model
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar, dataclass_transform
 
 from .backend import jax, jnp
 from .geometry.retraction import Retraction
@@ -18,15 +18,26 @@ Array = jax.Array
 State = Any  # any pytree: an array, or a frozen dataclass registered with `pytree`
 
 
-def pytree(cls: type | None = None, *, static: tuple[str, ...] = ()):
-    """Class decorator: a frozen dataclass whose fields are JAX data, but for those named in `static`."""
+T = TypeVar("T")
 
-    def wrap(c: type) -> type:
-        c = dataclass(frozen=True)(c)
-        names = [f for f in c.__dataclass_fields__ if f not in static]
-        return jax.tree_util.register_dataclass(c, data_fields=names, meta_fields=list(static))
 
-    return wrap if cls is None else wrap(cls)
+def _register(cls: type[T], static: tuple[str, ...]) -> type[T]:
+    made: Any = dataclass(frozen=True)(cls)
+    names = [f for f in made.__dataclass_fields__ if f not in static]
+    return jax.tree_util.register_dataclass(made, data_fields=names, meta_fields=list(static))
+
+
+@dataclass_transform(frozen_default=True)
+def pytree(cls: type[T]) -> type[T]:
+    """Class decorator: a frozen dataclass whose fields are JAX data."""
+    return _register(cls, ())
+
+
+@dataclass_transform(frozen_default=True)
+def pytree_with(static: tuple[str, ...]) -> Callable[[type[T]], type[T]]:
+    """Class decorator: a frozen dataclass whose fields are JAX data, but for those named in `static`, which are part of
+    what is compiled."""
+    return partial(_register, static=static)
 
 
 @dataclass(frozen=True)
@@ -37,7 +48,7 @@ class Noise:
     dim: int
 
 
-@partial(pytree, static=("step", "noise", "jacobian"))
+@pytree_with(static=("step", "noise", "jacobian"))
 class Process:
     """x' = step(params, x, u, dt, w). `jacobian(params, x, u, dt)` returns (F, G) for the model's retraction, or is None:
     then both come from automatic differentiation at the retraction's zero. F = d(x' [-] x0')/d xi, G = d(x' [-] x0')/d w,
@@ -49,7 +60,7 @@ class Process:
     jacobian: Callable[[Any, State, Any, Array], tuple[Array, Array | None]] | None = None
 
 
-@partial(pytree, static=("predict", "minus", "cov", "jacobian"))
+@pytree_with(static=("predict", "minus", "cov", "jacobian"))
 class Sensor:
     """z = predict(params, x, a) (+) noise of covariance cov(params, x, a); minus(z, z_hat) is the residual vector (m,).
 
@@ -137,13 +148,13 @@ class Filter(Protocol):
     ) -> tuple[Any, Info]: ...
 
 
-@partial(pytree, static=("retraction",))
+@pytree_with(static=("retraction",))
 class Model:
     """A retraction, a process and the sensors that belong together (their analytic Jacobians share the retraction)."""
 
     retraction: Retraction
     process: Process
-    sensors: tuple[Sensor, ...] = field(default=())
+    sensors: tuple[Sensor, ...] = ()
 
 
 def no_gate(max_dof: int = 64) -> Gate:

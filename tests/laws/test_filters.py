@@ -238,8 +238,10 @@ def _run_linear(filter, spreads, u, dt, ms, gate):
         return run(filter, LINEAR_MODEL, belief, u, dt, ms, gate)[2]
 
     over_cases = jax.vmap(one, in_axes=(None, 0, 0, 0))
-    return over_cases(None, u, dt, ms) if spreads is None else jax.vmap(over_cases, in_axes=(0, None, None, None))(
-        spreads, u, dt, ms
+    return (
+        over_cases(None, u, dt, ms)
+        if spreads is None
+        else jax.vmap(over_cases, in_axes=(0, None, None, None))(spreads, u, dt, ms)
     )
 
 
@@ -557,7 +559,9 @@ def numpy_mekf(d: AttitudeData, c: int) -> Outcome:
         both = expm(np.block([[-hat(phi), np.eye(3)], [np.zeros((3, 6))]]))  # exp and its integral
         F[:3] = np.hstack([both[:3, :3], both[:3, 3:] * t])
         v2, u2, eye = s.sigma_v[c] ** 2, s.sigma_u[c] ** 2, np.eye(3)
-        Q = np.block([[(v2 * t + u2 * t**3 / 3) * eye + d.extra[c, k], u2 * t**2 / 2 * eye], [u2 * t**2 / 2 * eye, u2 * t * eye]])
+        Q = np.block(
+            [[(v2 * t + u2 * t**3 / 3) * eye + d.extra[c, k], u2 * t**2 / 2 * eye], [u2 * t**2 / 2 * eye, u2 * t * eye]]
+        )
         R, P = Rotation.from_rotvec(-phi) * R, F @ P @ F.T + Q
         P_pred, infos = P, []
         for i in range(2):
@@ -1129,7 +1133,10 @@ def attitude_input(v):
 PROCESSES = {
     "attitude so3_left": (attitude_model(N_GYRO, so3_left), attitude_input, False),
     "drift so3_left": (attitude_drift_model(N_GYRO, so3_left), attitude_input, True),
-    **{f"xu2020 {r.name}": (xu2020.lie_model(1e-4, 1e-3, r), lambda v: v, False) for r in (so3_right, so3_left, gibbs_left)},
+    **{
+        f"xu2020 {r.name}": (xu2020.lie_model(1e-4, 1e-3, r), lambda v: v, False)
+        for r in (so3_right, so3_left, gibbs_left)
+    },
 }
 SENSORS = {
     **{f"stars {r.name}": (star_directions(1e-3, r), r) for r in (so3_left, gibbs_left, so3_right)},
@@ -1173,7 +1180,9 @@ def _jacobians(q, b, v, dt, stars, d):
         linear = jax.jacfwd(lambda p: quaternion.multiply(p, quaternion.exp(v)))(q)
         out["additive process"] = p.jacobian(p.params, q, v, dt)[0] - linear
         tangent = quaternion.rate_matrix(q)
-        H = jax.jacfwd(lambda dq: s.predict(s.params, quaternion_additive.boxplus(q, dq), stars).reshape(-1))(jnp.zeros(4))
+        H = jax.jacfwd(lambda dq: s.predict(s.params, quaternion_additive.boxplus(q, dq), stars).reshape(-1))(
+            jnp.zeros(4)
+        )
         out["additive sensor"] = (s.jacobian(s.params, q, stars) - H) @ tangent
         eye = jnp.eye(3)
         for side, J in (("right", so3.right_jacobian(d)), ("left", so3.left_jacobian(d))):

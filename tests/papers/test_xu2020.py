@@ -149,9 +149,7 @@ def test_a_start_179_deg_off_about_any_axis_converges(tmp_path):
 
 def test_consistent_tuning_from_a_wrong_start_is_worse_early(tmp_path):
     """What the Wahba fix is for: told 20 arcsec noise but started at X0 = I, P collapses after one wrong linear step."""
-    outcome = campaign(
-        tmp_path, ["lie"], tuning__q_w=1e-10, tuning__sigma_v=float(20 * ARCSEC)
-    )
+    outcome = campaign(tmp_path, ["lie"], tuning__q_w=1e-10, tuning__sigma_v=float(20 * ARCSEC))
     assert np.median(outcome.dataset["nees"].sel(estimator="lie").values[:, 0]) > 1e6
 
 

@@ -171,7 +171,11 @@ def simulate(setup: Setup) -> Simulated:
     star_t = star_t[_outside(star_t, setup.star_gaps)]
     record = Simulated(setup, gyro, pd.DataFrame(), nodes, q_nodes, drift)
     R_BN, R_SB = record.attitude(star_t), Rotation.from_quat(setup.q_sb)
-    star = _attitudes(setup, rng, star_t, R_BN, R_SB) if setup.stars is None else _directions(setup, rng, star_t, R_BN, R_SB)
+    star = (
+        _attitudes(setup, rng, star_t, R_BN, R_SB)
+        if setup.stars is None
+        else _directions(setup, rng, star_t, R_BN, R_SB)
+    )
     return replace(record, star=star)
 
 

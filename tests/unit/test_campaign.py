@@ -168,7 +168,7 @@ def test_a_crash_keeps_finished_blocks(tmp_path, monkeypatch):
         return compute(self, index, *args)
 
     monkeypatch.setattr(Engine, "compute", crash)
-    with pytest.raises(CampaignError, match="out of memory.*4 runs are kept"):
+    with pytest.raises(CampaignError, match=r"out of memory.*4 runs are kept"):
         run(tmp_path, 8)
     monkeypatch.undo()
     assert run(tmp_path, 8, resume=True).summary["runs"] == 8

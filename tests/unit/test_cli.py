@@ -153,7 +153,19 @@ def test_a_printed_scenario_runs_as_a_users_own(capsys, tmp_path):
 
 
 def test_ctrl_c_in_a_real_process_keeps_what_is_finished(tmp_path):
-    argv = [sys.executable, "-m", "helmstar", "run", "xu2020", "--runs", "4000", "--set", "updates=20", "--set", "width=4"]
+    argv = [
+        sys.executable,
+        "-m",
+        "helmstar",
+        "run",
+        "xu2020",
+        "--runs",
+        "4000",
+        "--set",
+        "updates=20",
+        "--set",
+        "width=4",
+    ]
     argv += ["--estimators", "lie,mekf_tuned", "--out", str(tmp_path), "--json"]
     process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     blocks = tmp_path / "blocks"

@@ -37,7 +37,9 @@ def test_filter_by_hand():
 def test_the_example_record_is_what_its_script_writes(tmp_path):
     load("make_telemetry").main(tmp_path)
     for name in ("gyro.csv", "stars.csv", "still.csv"):
-        fresh, kept = (np.loadtxt(f / name, delimiter=",", skiprows=1) for f in (tmp_path, ROOT / "examples" / "telemetry"))
+        fresh, kept = (
+            np.loadtxt(f / name, delimiter=",", skiprows=1) for f in (tmp_path, ROOT / "examples" / "telemetry")
+        )
         assert np.allclose(fresh, kept, rtol=1e-9, atol=1e-12)
 
 

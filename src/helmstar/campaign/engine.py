@@ -18,7 +18,6 @@ import numpy as np
 from ..backend import COMPILER_OPTIONS, jax, jnp
 from ..scenarios.experiment import Call, Experiment
 
-
 _PROGRAMS: dict[Any, Any] = {}
 """Compiled programs of this process: a second campaign with other data compiles nothing."""
 

@@ -21,6 +21,7 @@ from ..versions import versions
 from .engine import Engine
 from .store import Store
 
+
 @dataclass(frozen=True)
 class Outcome:
     """dataset: all finished runs; summary: the object of `--json`; interrupted: Ctrl-C came before the last run."""
@@ -133,9 +134,7 @@ def run_campaign(
     return Outcome(dataset, summary, interrupted)
 
 
-def _compute(
-    engine: Engine, store: Store, todo: list[int], workers: int, bar: Progress, width: int, runs: int
-) -> bool:
+def _compute(engine: Engine, store: Store, todo: list[int], workers: int, bar: Progress, width: int, runs: int) -> bool:
     """Compute and keep the blocks; True when Ctrl-C cut it short (blocks under way are still kept)."""
     steps_each = len(engine.names)
     task = bar.add(f"{runs} runs", len(todo) * steps_each)

@@ -1,8 +1,8 @@
 """A campaign's folder: manifest, finished blocks, and the one Dataset they make. NetCDF and JSON; nothing is pickled.
 
-    campaign.json      what was asked for; a resume must ask for the same
-    blocks/000000.nc   one finished block, written whole or not at all
-    results.nc         the Dataset of all finished runs
+campaign.json      what was asked for; a resume must ask for the same
+blocks/000000.nc   one finished block, written whole or not at all
+results.nc         the Dataset of all finished runs
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Store:
 
         A block that cannot be read is removed, so that a resume computes it again.
         """
-        parts = []
+        parts: list[xr.Dataset] = []
         for i in indices:
             path = self.blocks / f"{i:06d}.nc"
             try:
@@ -97,10 +97,12 @@ class Store:
                 path.unlink(missing_ok=True)
         if not parts:
             return None
-        parts.sort(key=lambda d: int(d["run"][0]))
-        data = xr.concat([p.drop_vars("seconds") for p in parts], "run") if len(parts) > 1 else parts[0].drop_vars("seconds")
-        weight = np.mean([p["seconds"].values for p in parts], axis=0)
-        data["us_per_step"] = ("estimator", 1e6 * weight / (parts[0].sizes["run"] * parts[0].sizes["time"]))
+        parts.sort(key=lambda d: int(d["run"].values[0]))
+        seconds = np.mean([p["seconds"].values for p in parts], axis=0)
+        steps = parts[0].sizes["run"] * parts[0].sizes["time"]
+        results: list[xr.Dataset] = [p.drop_vars("seconds") for p in parts]
+        data = xr.concat(results, "run") if len(results) > 1 else results[0]
+        data["us_per_step"] = ("estimator", 1e6 * seconds / steps)
         return data.isel(run=np.flatnonzero(data["run"].values < runs))
 
 

@@ -19,7 +19,9 @@ def chi_square_band(dof: int, runs: int, probability: float = 0.95) -> tuple[flo
     from scipy.stats import chi2
 
     if dof < 1 or runs < 1 or not 0.0 < probability < 1.0:
-        raise ValueError(f"dof {dof}, runs {runs}, probability {probability}: dof and runs from 1, probability in (0, 1)")
+        raise ValueError(
+            f"dof {dof}, runs {runs}, probability {probability}: dof and runs from 1, probability in (0, 1)"
+        )
     tail = 0.5 * (1.0 - probability)
     low, high = chi2.ppf([tail, 1.0 - tail], dof * runs) / runs
     return float(low), float(high)
@@ -28,7 +30,7 @@ def chi_square_band(dof: int, runs: int, probability: float = 0.95) -> tuple[flo
 def quadratic_form(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
     """error^T cov^-1 error over the last axes; NaN where the covariance is singular or an entry is not finite."""
     error, cov = np.asarray(error, float), np.asarray(cov, float)
-    ok = np.isfinite(error).all(-1) & np.isfinite(cov).all((-2, -1))
+    ok = np.asarray(np.isfinite(error).all(-1) & np.isfinite(cov).all((-2, -1)))
     safe = np.where(ok[..., None, None], cov, np.eye(cov.shape[-1]))
     ok &= np.abs(np.linalg.det(safe)) > 0
     safe = np.where(ok[..., None, None], safe, np.eye(cov.shape[-1]))

@@ -73,9 +73,7 @@ def prepare(sensor: Sensor, x: Any, m: Measurement) -> tuple[Array, Array, Array
     return e, rows, R
 
 
-def judge(
-    e: Array, S: Array, rows: Array, gate: Gate, refused: Array
-) -> tuple[Array, Array, Array, Array, Array]:
+def judge(e: Array, S: Array, rows: Array, gate: Gate, refused: Array) -> tuple[Array, Array, Array, Array, Array]:
     """Of a residual e with covariance S: whitening V (lower, V S V^T = I), NIS, degrees of freedom, status and whether
     the update is made. A NIS that is not finite (S singular, a residual of NaN) is refused and reopens nothing.
 

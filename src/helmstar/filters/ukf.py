@@ -77,11 +77,13 @@ class UnscentedKalmanFilter:
     retraction: Retraction
     carry: Carry = "transport"
 
-    def predict(self, belief: UnscentedBelief, process: Process, u: Any, dt: Array) -> tuple[UnscentedBelief, Predicted]:
+    def predict(
+        self, belief: UnscentedBelief, process: Process, u: Any, dt: Array
+    ) -> tuple[UnscentedBelief, Predicted]:
         """Belief after one step of dt seconds; F is the statistical linearisation P_xx' (P)^-1 that a smoother uses."""
         r, x, P = self.retraction, belief.mean, belief.cov
         n, q = r.dim, process.noise.dim
-        distance, centre_mean, centre_cov, w = belief.spread.weights(n + q)
+        distance, _, centre_cov, w = belief.spread.weights(n + q)
         root = small.cholesky(P)
         xi = _points(root, distance)
         noise = _points(_root(process.noise.cov(process.params, x, u, dt)), distance)

@@ -76,18 +76,10 @@ def from_matrix(R: Array) -> Array:
     No square root of a difference is taken, so the result and its gradient are accurate at every angle, pi included.
     """
     r = {(i, j): R[..., i, j] for i in range(3) for j in range(3)}
-    x = jnp.stack(
-        [1.0 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]], axis=-1
-    )
-    y = jnp.stack(
-        [r[0, 1] + r[1, 0], 1.0 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]], axis=-1
-    )
-    z = jnp.stack(
-        [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1.0 - r[0, 0] - r[1, 1] + r[2, 2], r[1, 0] - r[0, 1]], axis=-1
-    )
-    w = jnp.stack(
-        [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1.0 + r[0, 0] + r[1, 1] + r[2, 2]], axis=-1
-    )
+    x = jnp.stack([1.0 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]], axis=-1)
+    y = jnp.stack([r[0, 1] + r[1, 0], 1.0 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]], axis=-1)
+    z = jnp.stack([r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1.0 - r[0, 0] - r[1, 1] + r[2, 2], r[1, 0] - r[0, 1]], axis=-1)
+    w = jnp.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1.0 + r[0, 0] + r[1, 1] + r[2, 2]], axis=-1)
     # A compiler may evaluate a comparison again for each of its uses, with products and sums contracted differently. At
     # a tie (q_x = q_z: symmetric axes are common) derivatives then mix two columns and are wrong by as much as they are
     # large; seen in XLA at optimisation level 0. The weights move the ties to where no one goes.

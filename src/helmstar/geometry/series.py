@@ -24,7 +24,9 @@ def _horner(x: Array, coefficients: tuple[float, ...]) -> Array:
 def _piecewise(t2: Array, threshold: float, coefficients: tuple[float, ...], closed) -> Array:
     small = t2 < threshold
     safe = jnp.where(small, jnp.ones_like(t2), t2)
-    return jnp.where(small, _horner(jnp.where(small, t2, jnp.zeros_like(t2)), coefficients), closed(safe, jnp.sqrt(safe)))
+    return jnp.where(
+        small, _horner(jnp.where(small, t2, jnp.zeros_like(t2)), coefficients), closed(safe, jnp.sqrt(safe))
+    )
 
 
 # Truncation below 1e-17 relative at the threshold, first and second derivative included.
@@ -32,7 +34,19 @@ _COS = tuple((-1.0) ** k / factorial(2 * k) for k in range(9))
 _SINC = tuple((-1.0) ** k / factorial(2 * k + 1) for k in range(9))
 _WEDGE = tuple((-1.0) ** k / factorial(2 * k + 3) for k in range(12))
 # (1 - (t/2) cot(t/2)) / t^2 = sum |B_2k| t^(2k-2) / (2k)!, k = 1..
-_BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798, 174611 / 330, 854513 / 138)
+_BERNOULLI = (
+    1 / 6,
+    1 / 30,
+    1 / 42,
+    1 / 30,
+    5 / 66,
+    691 / 2730,
+    7 / 6,
+    3617 / 510,
+    43867 / 798,
+    174611 / 330,
+    854513 / 138,
+)
 _COT = tuple(b / factorial(2 * k + 2) for k, b in enumerate(_BERNOULLI))
 _ATAN = tuple((-1.0) ** k / (2 * k + 1) for k in range(9))
 

@@ -106,7 +106,10 @@ def inverse_spd(A: Array) -> Array:
 @jax.jit
 def matmul(A: Array, B: Array) -> Array:
     """A B as a sum of outer products: on a CPU several times faster than a batched `@` for sizes up to some 12."""
-    return sum((A[..., :, k, None] * B[..., k, None, :] for k in range(1, A.shape[-1])), A[..., :, 0, None] * B[..., 0, None, :])
+    return sum(
+        (A[..., :, k, None] * B[..., k, None, :] for k in range(1, A.shape[-1])),
+        A[..., :, 0, None] * B[..., 0, None, :],
+    )
 
 
 @jax.jit

@@ -93,7 +93,9 @@ def attitude_model(noise: GyroNoise, retraction: Retraction = so3_left, sensors:
     return Model(retraction, Process(_attitude_step, Noise(_attitude_noise, 3), noise, jacobian), sensors)
 
 
-def attitude_drift_model(noise: GyroNoise, retraction: Retraction = so3_left, sensors: tuple[Sensor, ...] = ()) -> Model:
+def attitude_drift_model(
+    noise: GyroNoise, retraction: Retraction = so3_left, sensors: tuple[Sensor, ...] = ()
+) -> Model:
     """Attitude and gyro drift (6 states, the state is `AttitudeDrift`); `retraction` is that of the attitude."""
     jacobian = _drift_jacobian if retraction is so3_left else None
     whole = product(AttitudeDrift, retraction, euclidean(3))

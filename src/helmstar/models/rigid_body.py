@@ -68,20 +68,22 @@ def simulate(
     from scipy.spatial.transform import Rotation
 
     time = np.asarray(time, float)
-    euler = torque is not None and inertia is not None and rate0 is not None
-    if (rate is not None) == euler:
+    if rate is not None and torque is None and inertia is None and rate0 is None:
+        euler, rate_of, torque_at, J, start = False, rate, rate, np.eye(3), np.empty(0)
+    elif rate is None and torque is not None and inertia is not None and rate0 is not None:
+        euler, rate_of, torque_at, J, start = True, torque, torque, np.asarray(inertia, float), np.asarray(rate0, float)
+    else:
         raise ValueError("give either rate, or inertia, torque and rate0")
-    J = np.asarray(inertia if euler else np.eye(3), float)
     J_inverse = np.linalg.inv(J)
 
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
-        q, w = y[:4], (y[4:] if euler else rate(t))
+        q, w = y[:4], (y[4:] if euler else rate_of(t))
         dq = _half_product(q, w, 1.0) if law == "printed" else _half_product(q, -w, -1.0)
         if not euler:
             return np.array(dq)
-        return np.array([*dq, *(J_inverse @ (torque(t) - np.cross(w, J @ w)))])
+        return np.array([*dq, *(J_inverse @ (torque_at(t) - np.cross(w, J @ w)))])
 
-    y0 = np.append(q0, rate0) if euler else np.asarray(q0, float)
+    y0 = np.concatenate([np.asarray(q0, float), start])
     step = float(np.min(np.diff(time))) if time.size > 1 else np.inf
     s = solve_ivp(
         derivative, (time[0], time[-1]), y0, method="DOP853", t_eval=time, rtol=1e-13, atol=1e-15, max_step=20 * step
@@ -89,7 +91,7 @@ def simulate(
     if not s.success:
         raise ValueError(f"the integrator stopped at t = {s.t[-1] if s.t.size else time[0]} s: {s.message}")
     q = s.y[:4].T / np.linalg.norm(s.y[:4].T, axis=1, keepdims=True)
-    w = s.y[4:].T if euler else np.array([rate(t) for t in time])
+    w = s.y[4:].T if euler else np.array([rate_of(t) for t in time])
     R = Rotation.from_quat(q)
     step_rotation = R[:-1].inv() * R[1:] if law == "printed" else (R[1:] * R[:-1].inv()).inv()
     return RigidBodyTruth(time, w, q, step_rotation.as_rotvec())

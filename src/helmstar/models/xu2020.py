@@ -37,9 +37,7 @@ class Tuning:
 
 def _step(params: Tuning, q: Array, u: Array, dt: Array, w: Array) -> Array:
     """(24): X A, with the noise w behind it on the right."""
-    return quaternion.normalise(
-        quaternion.multiply(quaternion.multiply(q, quaternion.exp(u)), quaternion.exp(w))
-    )
+    return quaternion.normalise(quaternion.multiply(quaternion.multiply(q, quaternion.exp(u)), quaternion.exp(w)))
 
 
 def _noise(params: Tuning, q: Array, u: Array, dt: Array) -> Array:

@@ -32,7 +32,7 @@ class ScenarioSpecification(BaseModel):
 
 def library() -> dict[str, str]:
     """The built-in scenarios: name -> TOML text."""
-    folder = resources.files(__package__) / "library"
+    folder = resources.files("helmstar.scenarios") / "library"
     files = sorted((f for f in folder.iterdir() if f.name.endswith(".toml")), key=lambda f: f.name)
     return {f.name.removesuffix(".toml"): f.read_text(encoding="utf-8") for f in files}
 

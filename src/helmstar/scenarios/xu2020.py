@@ -87,9 +87,7 @@ def _simulate_run(s: Setting, run_id: Array) -> Data:
     off = quaternion.multiply(s.q[0], quaternion.exp(s.start_error * axis))
     start = jnp.where(s.start_error >= 0, off, quaternion.identity())
     fix = svd(z[0], s.r_N, jnp.maximum(s.star_sigma, SIGMA_FLOOR))
-    return Data(
-        s.increment + s.gyro_sigma * gyro[1:], z[1:], start, fix.q_BN, fix.covariance, s.q[1:], s.r_N
-    )
+    return Data(s.increment + s.gyro_sigma * gyro[1:], z[1:], start, fix.q_BN, fix.covariance, s.q[1:], s.r_N)
 
 
 _SHARED = Data(0, 0, 0, 0, 0, None, None)  # which fields of Data have a run axis  # type: ignore[arg-type]
@@ -145,9 +143,7 @@ def estimate(model: Model, prior: Prior, stars: Array, data: Data, *, filter: An
         belief: Any = Gaussian(mean, cov)
         if prior.spread is not None:
             belief = UnscentedBelief(mean, cov, prior.spread)
-        m = Measurement(
-            data.z, jnp.broadcast_to(data.r_N, (steps, 2, 3)), jnp.broadcast_to(stars, (steps, 2))
-        )
+        m = Measurement(data.z, jnp.broadcast_to(data.r_N, (steps, 2, 3)), jnp.broadcast_to(stars, (steps, 2)))
 
         def keep(belief, predicted, infos):
             return belief, infos[0].nis, infos[0].dof
@@ -163,8 +159,12 @@ VARIABLES = {
     "error_rad": Variable(
         ("axis",), "f8", {"long_name": "error xi, X = X_hat exp([xi x])", "units": "rad", "frame": "N", "side": "right"}
     ),
-    "sigma_rad": Variable(("axis",), "f4", {"long_name": "1 sigma of the error by the filter", "units": "rad", "frame": "N"}),
-    "nees": Variable((), "f4", {"long_name": "normalised estimation error squared, 3 degrees of freedom", "units": "1"}),
+    "sigma_rad": Variable(
+        ("axis",), "f4", {"long_name": "1 sigma of the error by the filter", "units": "rad", "frame": "N"}
+    ),
+    "nees": Variable(
+        (), "f4", {"long_name": "normalised estimation error squared, 3 degrees of freedom", "units": "1"}
+    ),
     "nis": Variable((), "f4", {"long_name": "normalised innovation squared", "units": "1"}),
     "nis_dof": Variable((), "i2", {"long_name": "degrees of freedom of nis", "units": "1"}),
 }
@@ -250,7 +250,11 @@ class Experiment:
         """Truth and bound."""
         sigma = np.sqrt(np.diagonal(self.bound(), axis1=1, axis2=2))
         return {
-            "truth_q_bn": (("time", "quaternion"), self.truth.q[1:], {"long_name": "true attitude, l = X r", "units": "1"}),
+            "truth_q_bn": (
+                ("time", "quaternion"),
+                self.truth.q[1:],
+                {"long_name": "true attitude, l = X r", "units": "1"},
+            ),
             "bound_rad": (
                 ("time", "axis"),
                 sigma,

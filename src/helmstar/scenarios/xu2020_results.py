@@ -92,7 +92,11 @@ def claims(dataset: Any, summary: dict) -> list:
                 rms_of("lie_printed"),
                 rms_of("lie"),
                 f"1 sigma x, y, z {at_bound} at update {mark}",
-                "does not hold" if not holds else "holds in part" if printed_fails or "lie_printed" not in est else "holds",
+                "does not hold"
+                if not holds
+                else "holds in part"
+                if printed_fails or "lie_printed" not in est
+                else "holds",
                 "Update 150 is where the start-up transient ends. Equations (26), (27) and (30) mix frames: with the update on "
                 "the right the innovation must be X^T l - r, in inertial axes. As printed the error does not come below 1 deg.",
             )
@@ -104,7 +108,9 @@ def claims(dataset: Any, summary: dict) -> list:
                 _arrival_text(est["lie_printed"], runs) if "lie_printed" in est else "not run",
                 _arrival_text(est["lie"], runs) if "lie" in est else "not run",
                 "-",
-                "does not hold" if "lie" not in est or est["lie"]["converged"]["1deg"]["runs"] < runs else "holds in part",
+                "does not hold"
+                if "lie" not in est or est["lie"]["converged"]["1deg"]["runs"] < runs
+                else "holds in part",
                 "Convergence holds for the consistent equations alone.",
             )
         )
@@ -115,7 +121,8 @@ def claims(dataset: Any, summary: dict) -> list:
                 "The quaternion EKF's x error diverges.",
                 "section 4, Fig. 4",
                 f"two stars: {rms_of('quaternion_ekf')}; {q['diverged']}/{runs} diverged",
-                "one star only: " + (f"{rms_of('quaternion_ekf_one_star')}; {one['diverged']}/{runs} diverged" if one else "not run"),
+                "one star only: "
+                + (f"{rms_of('quaternion_ekf_one_star')}; {one['diverged']}/{runs} diverged" if one else "not run"),
                 f"1 sigma x, y, z {at_bound} at update {mark}",
                 "does not hold" if q["diverged"] == 0 else "holds in part",
                 "With both stars it converges like the filter on SO(3). With the star along x alone, the turn about x is not "
@@ -145,11 +152,13 @@ def claims(dataset: Any, summary: dict) -> list:
                 "P0 = 5 I, Q_w = 5e-5 I and Q_v = 0.125^2 I describe the noise.",
                 "(40)-(42)",
                 f"mean NEES of 3 states {_text(nees, '')}" if nees is not None else "not finite",
-                f"mean NEES tuned {_text(tuned['nees_mean'], '')}" if tuned and tuned["nees_mean"] else "tuned: not run",
+                f"mean NEES tuned {_text(tuned['nees_mean'], '')}"
+                if tuned and tuned["nees_mean"]
+                else "tuned: not run",
                 "3 when consistent",
                 "does not hold" if nees is not None and not 2.0 < nees < 4.0 else "measured",
-                "The simulated noise is not stated in the paper; for the noise of this scenario the printed covariance is far from it. The "
-                "gain, which is what matters for the error, depends on the ratio of Q_w to Q_v only.",
+                "The simulated noise is not stated in the paper; for the noise of this scenario the printed covariance is far "
+                "from it. The gain, which is what matters for the error, depends on the ratio of Q_w to Q_v only.",
             )
         )
     return out

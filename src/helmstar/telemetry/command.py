@@ -48,7 +48,9 @@ class Solution:
     gate: Gate
 
 
-def solve(telemetry: Telemetry, sensors: SensorsConfiguration, strict: bool = False, progress: bool = False) -> Solution:
+def solve(
+    telemetry: Telemetry, sensors: SensorsConfiguration, strict: bool = False, progress: bool = False
+) -> Solution:
     """Filter and smooth a record.
 
     Raises DataError when the rows do not suffice, or, with `strict`, when one of them is bad.
@@ -158,7 +160,9 @@ def _gate(sensors: SensorsConfiguration) -> Gate:
     return chi_square_gate(f.gate_probability, 256, f.reopen_after) if f.gate_probability > 0 else no_gate(256)
 
 
-def _levels(sensors: SensorsConfiguration, epochs: Epochs, between: Any, gate: Gate) -> tuple[NoiseLevels, dict[str, str]]:
+def _levels(
+    sensors: SensorsConfiguration, epochs: Epochs, between: Any, gate: Gate
+) -> tuple[NoiseLevels, dict[str, str]]:
     """Noise levels, and for each where it comes from."""
     known: dict[str, float] = {}
     if sensors.gyro.arw is not None:
@@ -176,7 +180,12 @@ def _levels(sensors: SensorsConfiguration, epochs: Epochs, between: Any, gate: G
 
 
 def _start(
-    sensors: SensorsConfiguration, epochs: Epochs, between: Any, levels: NoiseLevels, drift: np.ndarray, sigma: np.ndarray
+    sensors: SensorsConfiguration,
+    epochs: Epochs,
+    between: Any,
+    levels: NoiseLevels,
+    drift: np.ndarray,
+    sigma: np.ndarray,
 ) -> tuple[Start, str]:
     first = int(between.epochs[0])
     cov = epochs.shape[first] * levels.sigma**2
@@ -265,7 +274,7 @@ def result_of(solution: Solution, telemetry: Telemetry, files: Sequence[Path], c
             "estimates": len(s.timeline.time),
             "gyro_before_start": int(np.sum(telemetry.gyro.time < s.timeline.time[0])),
         },
-        "updates": int(len(u.nis)),
+        "updates": len(u.nis),
         "drift_arcsec_s": [float(v) for v in s.filtered.drift[-1] / ARCSEC],
         "drift_sigma_arcsec_s": [float(v) for v in sigma[3:] / ARCSEC],
         "attitude_sigma_arcsec": [float(v) for v in sigma[:3] / ARCSEC],

@@ -71,7 +71,9 @@ def model_of(levels: NoiseLevels, directions: bool) -> Model:
 
 
 @partial(jax.jit, static_argnames=())
-def _forward(model: Model, belief: Gaussian, refused: Array, u: GyroInput, dt: Array, m: Measurement, gate: Gate) -> Any:
+def _forward(
+    model: Model, belief: Gaussian, refused: Array, u: GyroInput, dt: Array, m: Measurement, gate: Gate
+) -> Any:
     return run(FILTER, model, belief, u, dt, (m,), gate, refused)
 
 
@@ -105,7 +107,9 @@ class Record:
         present = (number >= 0) & self.used[np.maximum(number, 0)]
         e, j = self.epochs, np.maximum(number, 0)
         if e.star_B is not None and e.star_N is not None and e.mask is not None:
-            m = Measurement(jnp.asarray(e.star_B[j]), jnp.asarray(e.star_N[j]), jnp.asarray(e.mask[j] & present[:, None]))
+            m = Measurement(
+                jnp.asarray(e.star_B[j]), jnp.asarray(e.star_N[j]), jnp.asarray(e.mask[j] & present[:, None])
+            )
         else:
             R = e.shape[j] * self.levels.sigma**2
             m = Measurement(jnp.asarray(e.q_BN[j]), jnp.asarray(R), jnp.asarray(present[:, None]))

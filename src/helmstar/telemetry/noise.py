@@ -163,7 +163,9 @@ def _search(
     count = {1: 64, 2: 16, 3: 6}[len(names)]
     best = centre
     for _ in range(8):
-        axes = [np.clip(np.linspace(c - h, c + h, count), a, b) for c, h, a, b in zip(centre, half, low, high, strict=True)]
+        axes = [
+            np.clip(np.linspace(c - h, c + h, count), a, b) for c, h, a, b in zip(centre, half, low, high, strict=True)
+        ]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(names))
         values = []
         for i in range(0, len(points), BATCH):

@@ -1,25 +1,34 @@
 """The gyro as a function of time: its integral between any two instants, and how far to trust it across a gap.
 
-A rate known at instants is taken as linear between them (the trapezoid rule); a mean over an interval as a line through
-it whose slope comes from its neighbours and whose mean is the measured one. So an attitude between two gyro rows is
-reached by interpolated rates.
+A rate known at instants is taken as linear between them; the trapezoid rule's next term, -dt/12 times the change of the
+slope, is added, which matters in slews and costs nothing elsewhere. A mean over an interval is a line through it whose
+slope comes from its neighbours and whose mean is the measured one. So an attitude between two gyro rows is reached by
+interpolated rates. What no row covers is bridged, see `bridge`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
 from ..io.screening import GAP_FACTOR
+from .bridge import Clean, bridge
+
+MISSING = 1.5
+"""A step longer than this many median steps has lost rows, where increments and means are concerned."""
+USUAL = 0.2
+"""Share of such steps above which they are the nature of the record and no loss."""
 
 
 @dataclass(frozen=True)
 class RateSignal:
     """Piecewise linear rate on pieces [start, end] (n,): value at the start and at the end, (n, 3) rad/s in B.
 
-    Pieces touch. `gap` (n,) marks those that bridge missing rows.
+    Pieces touch. `gap` (n,) marks those that bridge missing rows, `sigma` (n, 3) is how well their mean rate is known
+    (1 sigma in rad/s; 0 elsewhere).
     """
 
     start: np.ndarray
@@ -27,6 +36,7 @@ class RateSignal:
     first: np.ndarray
     last: np.ndarray
     gap: np.ndarray
+    sigma: np.ndarray
     period: float
 
     @property
@@ -34,23 +44,27 @@ class RateSignal:
         """First and last instant that the rate is known at; half a median step beyond is still answered."""
         return float(self.start[0]), float(self.end[-1])
 
-    def _piece(self, t: np.ndarray) -> np.ndarray:
+    @cached_property
+    def _whole(self) -> np.ndarray:
+        steps = 0.5 * (self.end - self.start)[:, None] * (self.first + self.last)
+        return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+    def piece(self, t: np.ndarray) -> np.ndarray:
+        """Number of the piece that holds t."""
         return np.clip(np.searchsorted(self.start, t, side="right") - 1, 0, len(self.start) - 1)
 
     def integral(self, t: np.ndarray) -> np.ndarray:
         """Integral of the rate from the signal's start to t, rad (..., 3)."""
-        width = (self.end - self.start)[:, None]
-        whole = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * width * (self.first + self.last), axis=0)])
-        i = self._piece(t)
+        i = self.piece(t)
         tau = (t - self.start[i])[:, None]
-        slope = (self.last[i] - self.first[i]) / width[i]
-        return whole[i] + tau * self.first[i] + 0.5 * tau**2 * slope
+        slope = (self.last[i] - self.first[i]) / (self.end[i] - self.start[i])[:, None]
+        return self._whole[i] + tau * self.first[i] + 0.5 * tau**2 * slope
 
     def mean_rates(self, grid: np.ndarray) -> np.ndarray:
         """Mean rate (n-1, 3) over the steps of a grid that holds every piece's ends, with the coning term: R_BN turns by
         exp(-[mean dt x]) over a step in which the rate goes linearly from w0 to w1, mean = (w0 + w1)/2 + dt/12 w0 x w1."""
         a, b = grid[:-1], grid[1:]
-        i = self._piece(0.5 * (a + b))
+        i = self.piece(0.5 * (a + b))
         dt = (b - a)[:, None]
         slope = (self.last[i] - self.first[i]) / (self.end[i] - self.start[i])[:, None]
         w0 = self.first[i] + slope * (a - self.start[i])[:, None]
@@ -58,55 +72,56 @@ class RateSignal:
         return 0.5 * (w0 + w1) + dt / 12.0 * np.cross(w0, w1)
 
     def gap_variance(self, grid: np.ndarray) -> np.ndarray:
-        """Additional attitude variance (n-1,) in rad^2 per axis of each step of the grid; zero outside gaps.
+        """Additional attitude variance (n-1, 3) in rad^2 of each step of the grid; zero outside gaps.
 
-        Judged on the data themselves: over clean stretches as long as the gap, how far is the true mean rate from the
-        mean of the two end rates? That rms times the gap's length is the error at its end; a step takes its share.
+        The error at a gap's end is its length times `sigma`; a step within takes its share of the variance.
         """
-        extra = np.zeros(len(grid) - 1)
-        inside = self._piece(0.5 * (grid[:-1] + grid[1:]))
-        for g in np.flatnonzero(self.gap):
-            length = self.end[g] - self.start[g]
-            sigma = self._bridging_error(length, float(np.max(np.abs(self.last[g] - self.first[g]))))
-            steps = inside == g
-            extra[steps] = sigma**2 * length * np.diff(grid)[steps]
-        return extra
-
-    def _bridging_error(self, length: float, jump: float) -> float:
-        """1 sigma (rad/s) of a mean rate over `length` that is interpolated from its ends."""
-        clean = np.flatnonzero(~self.gap)
-        centre = 0.5 * (self.start + self.end)
-        a = self.start[clean]
-        a = a[a + length <= self.end[-1]]
-        if len(a) > 2000:
-            a = a[:: len(a) // 2000]
-        gaps_before = np.concatenate([[0], np.cumsum(self.gap)])
-        i, j = self._piece(a), self._piece(a + length)
-        whole = gaps_before[j + 1] == gaps_before[i]
-        a, i, j = a[whole], i[whole], j[whole]
-        if len(a) < 5:  # too few stretches as long as that: nothing is known but the spread of the rates
-            spread = np.sqrt(np.mean(np.var(0.5 * (self.first + self.last), axis=0))) if len(centre) > 1 else 0.0
-            return float(np.hypot(0.5 * jump, spread))
-        mean = (self.integral(a + length) - self.integral(a)) / length
-        ends = 0.5 * (self.first[i] + self.last[j])
-        return float(np.sqrt(np.mean((mean - ends) ** 2)))
+        i = self.piece(0.5 * (grid[:-1] + grid[1:]))
+        return self.sigma[i] ** 2 * ((self.end - self.start)[i] * np.diff(grid))[:, None]
 
 
 def rate_signal(
-    time: np.ndarray, rate: np.ndarray, step: np.ndarray, reading: Literal["instant", "mean_since_previous"]
+    time: np.ndarray,
+    rate: np.ndarray,
+    step: np.ndarray,
+    reading: Literal["instant", "mean_since_previous"],
+    increments: bool = False,
 ) -> RateSignal:
-    """From increasing times (n,) and rates (n, 3); `step` (n,) is what a mean covers (NaN: since the row before).
+    """From increasing times (n,) and rates (n, 3); `step` (n,) is the time since the row before (NaN: not known).
 
-    Raises ValueError for fewer than two rows.
+    `increments`: the rates of a mean are increments over `step`. Raises ValueError for fewer than two rows.
     """
     if len(time) < 2:
         raise ValueError("a rate signal needs at least two rows")
+    raw = _instants(time, rate) if reading == "instant" else _means(time, rate, step, increments)
+    if not raw.gap.any():
+        return raw
+    tips = (raw.first, raw.last) if reading == "instant" else (0.5 * (raw.first + raw.last),) * 2
+    clean = Clean(raw.start, raw.end, raw.gap, raw.period, raw.integral, *tips)
+    first, last, sigma = bridge(clean, raw.first, raw.last)
+    return replace(raw, first=first, last=last, sigma=sigma)
+
+
+def _instants(time: np.ndarray, rate: np.ndarray) -> RateSignal:
     dt = np.diff(time)
     period = float(np.median(dt))
-    if reading == "instant":
-        return RateSignal(time[:-1], time[1:], rate[:-1], rate[1:], dt > GAP_FACTOR * period, period)
+    gap = dt > GAP_FACTOR * period
+    first, last = rate[:-1].copy(), rate[1:].copy()
+    if len(time) > 2:
+        slope = (rate[2:] - rate[:-2]) / (time[2:] - time[:-2])[:, None]
+        known = ~(gap[1:] | gap[:-1])
+        inner = known[1:] & known[:-1]
+        change = np.where(inner[:, None], slope[1:] - slope[:-1], 0.0)
+        first[1:-1] -= dt[1:-1, None] / 12.0 * change
+        last[1:-1] -= dt[1:-1, None] / 12.0 * change
+    return RateSignal(time[:-1], time[1:], first, last, gap, np.zeros_like(first), period)
 
-    covered = np.where(np.isfinite(step), step, np.concatenate([[period], dt]))
+
+def _means(time: np.ndarray, rate: np.ndarray, step: np.ndarray, increments: bool) -> RateSignal:
+    dt = np.diff(time)
+    period = float(np.median(dt))
+    step = np.where(np.isfinite(step), step, np.concatenate([[period], dt]))
+    rate, covered = _coverage(rate, step, period, increments)
     covered = np.minimum(covered, np.concatenate([[np.inf], dt]))
     start = time - covered
     # Slope from the neighbouring means, none where a neighbour is missing or far.
@@ -124,8 +139,32 @@ def rate_signal(
     ends = np.concatenate([time, start[open_ + 1]])
     firsts = np.concatenate([first, rate[open_]])
     lasts = np.concatenate([last, rate[open_ + 1]])
-    bridged = np.concatenate([covered > GAP_FACTOR * period, np.ones(len(open_), dtype=bool)])
+    bridged = np.concatenate([np.zeros(len(time), dtype=bool), np.ones(len(open_), dtype=bool)])
     order = np.argsort(starts, kind="stable")
     starts, ends, firsts, lasts, bridged = (x[order] for x in (starts, ends, firsts, lasts, bridged))
     starts = np.concatenate([starts[:1], ends[:-1]])  # pieces touch to the bit
-    return RateSignal(starts, ends, firsts, lasts, bridged, period)
+    return RateSignal(starts, ends, firsts, lasts, bridged, np.zeros_like(firsts), period)
+
+
+def _coverage(rate: np.ndarray, step: np.ndarray, period: float, increments: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Rates, and the time that each covers, where a step is longer than usual because rows before it are lost.
+
+    A row after a loss may cover the whole time since the row that is left (an accumulating counter) or the usual period
+    only (the lost rows took their part with them). Increments tell, by the rates on either side; when they do not, and
+    for means, it is the usual period, and what is open is a gap.
+    """
+    long = step > MISSING * period
+    if not long.any() or long.mean() > USUAL:
+        return rate, step
+    short = np.where(long, period, step)
+    if not increments:
+        return rate, short
+    shorter = rate * (step / short)[:, None]
+    rows = np.flatnonzero(long)
+    rows = rows[(rows > 0) & (rows < len(rate) - 1)]
+    beside = 0.5 * (rate[rows - 1] + rate[np.minimum(rows + 1, len(rate) - 1)])
+    off_whole = np.median(np.linalg.norm(rate[rows] - beside, axis=1)) if len(rows) else np.inf
+    off_short = np.median(np.linalg.norm(shorter[rows] - beside, axis=1)) if len(rows) else 0.0
+    if off_whole < 0.5 * off_short:
+        return rate, step
+    return shorter, short

@@ -86,9 +86,7 @@ def intervals(between: Between, epochs: Epochs, drift: np.ndarray) -> Intervals:
     corrected = np.einsum("mij,j->mi", between.J, drift)
     q = quaternion.multiply(quaternion.exp(jnp.asarray(corrected)), jnp.asarray(between.turn))
     turn = -np.asarray(quaternion.log(q))
-    return Intervals(
-        epochs.q_BN[between.epochs], epochs.shape[between.epochs], turn, between.duration, between.extra
-    )
+    return Intervals(epochs.q_BN[between.epochs], epochs.shape[between.epochs], turn, between.duration, between.extra)
 
 
 def pair_sigma(between: Between, epochs: Epochs, levels: NoiseLevels) -> np.ndarray:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..attitude import davenport
-from ..io.telemetry import AttitudeRows, DirectionRows
+from ..io.telemetry import AttitudeRows
 from .rates import RateSignal
 
 
 @dataclass(frozen=True)
 class Epochs:
     """Star measurements by epoch: time (m,); q_BN (m, 4) measured or solved, NaN where an epoch cannot be solved alone;
-    shape (m, 3, 3): covariance in B in units of sigma^2 (the identity, or Wahba's for directions, or rad^2 when `scaled`
-    is False); file and row of the epoch's (first) row. For directions star_B, star_N (m, k, 3) and mask (m, k) too."""
+    shape (m, 3, 3): covariance in B in units of sigma^2 (the identity, or Wahba's for directions, or rad^2 when the
+    configuration gives it); file and row of the epoch's (first) row.
+
+    Of star directions also: star_B, star_N (m, 3), the one star of an epoch that cannot be solved; misfit (m,), the sum of
+    squares in rad^2 by which the stars of an epoch miss its solution, and its degrees of freedom misfit_dof (m,)."""
 
     time: np.ndarray
     q_BN: np.ndarray
@@ -25,18 +27,27 @@ class Epochs:
     files: tuple[str, ...]
     star_B: np.ndarray | None = None
     star_N: np.ndarray | None = None
-    mask: np.ndarray | None = None
+    misfit: np.ndarray | None = None
+    misfit_dof: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.time)
 
+    @property
+    def solved(self) -> np.ndarray:
+        """Which epochs (m,) have an attitude of their own."""
+        return np.isfinite(self.q_BN[:, 0])
+
+    @property
+    def directions(self) -> bool:
+        """Whether these are solved from star directions."""
+        return self.star_B is not None
+
     def select(self, index: np.ndarray) -> Epochs:
         """Those at an index or mask."""
-        pick = lambda a: None if a is None else a[index]  # noqa: E731  (one expression for nine fields)
-        return Epochs(
-            self.time[index], self.q_BN[index], self.shape[index], self.file[index], self.row[index], self.files,
-            pick(self.star_B), pick(self.star_N), pick(self.mask),
-        )  # fmt: skip
+        names = ("time", "q_BN", "shape", "file", "row", "star_B", "star_N", "misfit", "misfit_dof")
+        given = {name: getattr(self, name) for name in names}
+        return replace(self, **{name: array[index] for name, array in given.items() if array is not None})
 
 
 def attitude_epochs(rows: AttitudeRows, shape: np.ndarray) -> Epochs:
@@ -45,28 +56,11 @@ def attitude_epochs(rows: AttitudeRows, shape: np.ndarray) -> Epochs:
     return Epochs(rows.time, rows.q_BN, np.broadcast_to(shape, (n, 3, 3)).copy(), rows.file, rows.row, rows.files)
 
 
-def direction_epochs(rows: DirectionRows) -> Epochs:
-    """Of star directions: rows of equal time are one epoch, padded to the largest number of stars."""
-    time, first, which, count = np.unique(rows.time, return_index=True, return_inverse=True, return_counts=True)
-    k = int(count.max())
-    place = np.arange(len(rows)) - np.repeat(np.concatenate([[0], np.cumsum(count)[:-1]]), count)
-    order = np.argsort(which, kind="stable")
-    slot = np.empty(len(rows), dtype=int)
-    slot[order] = place
-    shape = (len(time), k)
-    star_B, star_N = np.zeros((*shape, 3)), np.zeros((*shape, 3))
-    star_B[..., 0] = star_N[..., 0] = 1.0
-    mask = np.zeros(shape, dtype=bool)
-    star_B[which, slot], star_N[which, slot], mask[which, slot] = rows.star_B, rows.star_N, True
-    s = davenport(star_B, star_N, 1.0, mask)
-    return Epochs(time, s.q_BN, s.covariance, rows.file[first], rows.row[first], rows.files, star_B, star_N, mask)
-
-
 @dataclass(frozen=True)
 class Timeline:
-    """time (n + 1,): the start and the end of each of n steps. rate (n, 3): mean rate in B over a step; extra (n,): added
-    attitude variance of a step, rad^2 per axis; gyro_row (n,): whether a gyro row ends the step. epoch (n + 1,): number
-    of the star epoch at each time, -1 for none; time[0] is that of the first epoch."""
+    """time (n + 1,): the start and the end of each of n steps. rate (n, 3): mean rate in B over a step; extra (n, 3): added
+    attitude variance of a step, rad^2 about each axis. epoch (n + 1,): number of the star epoch at each time, -1 for
+    none; time[0] is that of the first epoch."""
 
     time: np.ndarray
     rate: np.ndarray
@@ -77,27 +71,23 @@ class Timeline:
 SAME_INSTANT_S = 1e-9
 
 
-def build_timeline(signal: RateSignal, epochs: Epochs) -> tuple[Timeline, np.ndarray]:
-    """Timeline from the first usable epoch to the end of the gyro data, and a mask (m,) of the epochs on it.
-
-    Epochs before the first or after the last gyro instant, by more than half a median step, cannot be reached.
-    """
+def reachable(signal: RateSignal, epochs: Epochs) -> np.ndarray:
+    """Mask (m,) of the epochs that the gyro data reach: not more than half a median step before or after them."""
     low, high = signal.span
     margin = 0.5 * signal.period
-    usable = (epochs.time >= low - margin) & (epochs.time <= high + margin)
-    if not usable.any():
-        empty = np.empty(0)
-        return Timeline(empty, np.empty((0, 3)), empty, np.empty(0, dtype=int)), usable
-    times = epochs.time[usable]
-    start = times[0]
+    return (epochs.time >= low - margin) & (epochs.time <= high + margin)
+
+
+def build_timeline(signal: RateSignal, epochs: Epochs) -> Timeline:
+    """Timeline from the first epoch to the end of the gyro data; every epoch must be `reachable`."""
+    times = epochs.time
     ends = np.append(signal.start, signal.end[-1])
-    grid = np.union1d(np.concatenate([ends[ends > start], [start]]), times)
+    grid = np.union1d(ends[ends > times[0]], times)
     # Instants that differ by rounding alone would make steps of no length; star times win.
-    close = np.flatnonzero(np.diff(grid) < SAME_INSTANT_S)
     is_star = np.isin(grid, times)
-    drop = np.where(is_star[close] & ~is_star[close + 1], close + 1, close)
-    grid = np.delete(grid, drop)
+    close = np.flatnonzero(np.diff(grid) < SAME_INSTANT_S)
+    drop = np.where(is_star[close], close + 1, close)
+    grid = np.delete(grid, drop[~is_star[drop]])
     epoch = np.full(len(grid), -1)
-    numbers = np.flatnonzero(usable)
-    epoch[np.searchsorted(grid, times)] = numbers
-    return Timeline(grid, signal.mean_rates(grid), signal.gap_variance(grid), epoch), usable
+    epoch[np.searchsorted(grid, times)] = np.arange(len(times))
+    return Timeline(grid, signal.mean_rates(grid), signal.gap_variance(grid), epoch)
