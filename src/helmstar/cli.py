@@ -59,6 +59,10 @@ def parser() -> argparse.ArgumentParser:
         "--set", action="append", default=[], metavar="KEY=VALUE", help="override any key of the scenario; repeatable"
     )
     c.add_argument("--workers", type=int, metavar="W", help="blocks of runs computed side by side (default: cores)")
+    c.add_argument(
+        "--batch", type=int, metavar="N", help="runs a worker takes at a time, in whole blocks (default: one)"
+    )
+    c.add_argument("--dask", metavar="ADDRESS", help='compute on a Dask cluster (pip install "helmstar[dask]")')
     c.add_argument("--resume", action="store_true", help="go on with an interrupted campaign in the output folder")
     _common(c, "helmstar-out/SCENARIO-SEED")
     c.set_defaults(call=_run)
@@ -144,6 +148,8 @@ def _run(args: argparse.Namespace) -> int:
     name, spec = load(args.scenario, overrides)
     if args.workers is not None and args.workers < 1:
         raise ConfigurationError(f"--workers {args.workers}: must be at least 1")
+    if args.batch is not None and args.batch < 1:
+        raise ConfigurationError(f"--batch {args.batch}: must be at least 1")
     _say(f"{name}: {spec.runs} runs, seed {spec.seed}")
     from .campaign import run_campaign
 
@@ -160,6 +166,8 @@ def _run(args: argparse.Namespace) -> int:
         estimators=None if args.estimators is None else args.estimators.split(","),
         resume=args.resume,
         workers=args.workers,
+        batch=args.batch,
+        dask=args.dask,
     )
     from .report.monte_carlo import write_monte_carlo_report
 

@@ -71,12 +71,12 @@ def unit_quaternions():
 
 
 def error_in_ulps(actual, expected, scale=1.0) -> float:
-    """Largest |actual - expected| over eps of actual's dtype times scale. A NaN is infinitely wrong; below the smallest
-    normal number a difference is none (XLA flushes subnormal numbers to zero)."""
+    """Largest |actual - expected| over eps of actual's dtype times scale. A NaN is infinitely wrong; of the size of
+    the smallest normal number a difference is none (XLA flushes to zero what is below, the half of an angle say)."""
     actual = np.asarray(actual)
     info = np.finfo(actual.dtype)
     e = np.abs(actual.astype(np.float64) - np.asarray(expected, np.float64))
-    e = np.where(e <= info.tiny, 0.0, e) / (info.eps * np.maximum(scale, info.tiny))
+    e = np.where(e <= 4 * info.tiny, 0.0, e) / (info.eps * np.maximum(scale, info.tiny))
     return float(np.max(np.where(np.isnan(e), np.inf, e)))
 
 
@@ -229,7 +229,7 @@ def test_from_matrix_is_scipys(dtype, phi):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @LAW
-@given(rotation_vectors(1.0).map(lambda v: v + [0.0, 0.0, 1e-6]))
+@given(rotation_vectors(1.0).map(lambda v: v + 1e-6))
 def test_from_matrix_of_half_turns(dtype, axes):
     """R = 2 n n^T - I about random axes; and about the special ones, exact where n is along an axis."""
     for n in (vectors(axes, np.ones(N)), np.resize(AXES, (N, 3))):
@@ -431,7 +431,7 @@ def test_batch_axes_vmap_and_loop_agree():
     q, p = true_exp(phi), true_exp(phi[::-1] + 0.1)
 
     def everything(p, q, v):
-        return of_two(p, q) | of_one(q, v)
+        return of_two.__wrapped__(p, q) | of_one.__wrapped__(q, v)
 
     single = plain_jit(everything)
     batched, mapped = single(p, q, phi), plain_jit(jax.vmap(jax.vmap(everything)))(p, q, phi)

@@ -200,7 +200,7 @@ def test_a_singular_matrix_gives_no_finite_inverse(n, dtype):
 
 @pytest.mark.parametrize(("n", "dtype"), [(6, np.float64), (9, np.float32)])
 def test_the_inverse_is_symmetric_to_the_bit_and_calls_no_library(n, dtype):
-    """As compiled by default, at sizes where blocked sums (a library's product) are symmetric no longer. LAPACK would be a custom call to lapack_*."""
+    """As compiled by default (a product in blocks, such as `@`, would not be, at 9). LAPACK would be a custom call."""
     A = problem(5, n, dtype)[0]
     compiled = jax.jit(small.inverse_spd).lower(A).compile()
     inverse = compiled(A)

@@ -24,7 +24,9 @@ def prepared(**overrides):
     return build(name, spec), spec
 
 
-def run(folder: Path, runs: int, names=("lie", "mekf_tuned"), resume=False, workers=1, **overrides):
+def run(
+    folder: Path, runs: int, names=("lie", "mekf_tuned"), resume=False, workers=1, batch=None, dask=None, **overrides
+):
     experiment, spec = prepared(**overrides)
     return run_campaign(
         experiment,
@@ -37,6 +39,8 @@ def run(folder: Path, runs: int, names=("lie", "mekf_tuned"), resume=False, work
         estimators=names,
         resume=resume,
         workers=workers,
+        batch=batch,
+        dask=dask,
         progress=False,
     )
 
@@ -75,8 +79,24 @@ def test_the_bits_do_not_depend_on_runs_workers_or_resume(eleven, tmp_path):
     few = run(tmp_path / "a", 3)
     assert same_bits(few.dataset, eleven.dataset.isel(run=slice(0, 3)))
     assert same_bits(run(tmp_path / "b", 11, workers=2).dataset, eleven.dataset)
+    assert same_bits(run(tmp_path / "c", 11, workers=2, batch=7).dataset, eleven.dataset)
     again = run(tmp_path / "a", 11, resume=True)
     assert same_bits(again.dataset, eleven.dataset)
+
+
+def test_a_dask_cluster_gives_the_same_bits(eleven, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="the dask extra is not installed: this test did not run")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as cluster:
+        outcome = run(tmp_path, 11, dask=cluster.scheduler_address)
+    assert same_bits(outcome.dataset, eleven.dataset)
+
+
+def test_a_dask_address_without_a_scheduler(tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="the dask extra is not installed: this test did not run")
+    with pytest.raises(CampaignError, match="no scheduler answers"):
+        run(tmp_path, 4, dask="not-an-address://x")
 
 
 def test_another_estimator_leaves_the_others_as_they_are(eleven, tmp_path):

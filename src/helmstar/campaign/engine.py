@@ -93,3 +93,13 @@ class Engine:
             arrays[name] = {k: np.asarray(v).astype(e.variables[k].dtype) for k, v in result.items()}
             done()
         return Block(index, runs, arrays, seconds)
+
+
+def compute_block(name: str, specification: Mapping[str, Any], names: tuple[str, ...], index: int) -> Block:
+    """One block from nothing but data: what a worker elsewhere is asked for. Programs stay in its process."""
+    from ..scenarios.specification import build, specification_of, validate
+
+    spec = validate(specification_of(specification["experiment"]), specification, "campaign")
+    engine = Engine(build(name, spec), names)
+    engine.compile(1)
+    return engine.compute(index)

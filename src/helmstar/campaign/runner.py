@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from ..errors import CampaignError, ConfigurationError
 from ..progress import Progress
 from ..scenarios.experiment import Experiment
 from ..versions import versions
-from .engine import Engine
+from .engine import Block, Engine, compute_block
 from .store import Store
 
 
@@ -64,13 +64,16 @@ def run_campaign(
     estimators: Sequence[str] | None = None,
     resume: bool = False,
     workers: int | None = None,
+    batch: int | None = None,
+    dask: str | None = None,
     progress: bool = True,
 ) -> Outcome:
     """All runs of a campaign, in `folder`.
 
     specification: the validated keys (for the manifest); configuration: the same as TOML or JSON text for the report;
-    command: what reproduces it. Raises CampaignError or ConfigurationError; on Ctrl-C the outcome holds what is finished,
-    and KeyboardInterrupt is raised only when nothing is.
+    command: what reproduces it; batch: runs that a worker takes at a time, rounded up to whole blocks; dask: address of a
+    scheduler that computes the blocks instead. Raises CampaignError or ConfigurationError; on Ctrl-C the outcome holds what is
+    finished, and KeyboardInterrupt is raised only when nothing is.
     """
     begin = time.perf_counter()
     names = choose(experiment, estimators)
@@ -88,15 +91,17 @@ def run_campaign(
     needed = range(-(-runs // experiment.width))
     todo = [i for i in needed if i not in set(store.finished())]
     interrupted = False
-    engine = Engine(experiment, names)
     with Progress(progress) as bar:
         try:
-            if todo:
+            if todo and dask is not None:
+                interrupted = _compute_on_dask(experiment, names, dask, store, todo, bar, runs)
+            elif todo:
+                engine = Engine(experiment, names)
                 if engine.programs:
                     task = bar.add(f"compiling {engine.programs} programs", engine.programs)
                     engine.compile(workers, lambda: bar.advance(task))
                     bar.finish(task)
-                interrupted = _compute(engine, store, todo, workers, bar, experiment.width, runs)
+                interrupted = _compute(engine, store, todo, workers, batch or 1, bar, runs)
         except KeyboardInterrupt:
             interrupted = True
     finished = [i for i in store.finished() if i in needed]
@@ -134,32 +139,93 @@ def run_campaign(
     return Outcome(dataset, summary, interrupted)
 
 
-def _compute(engine: Engine, store: Store, todo: list[int], workers: int, bar: Progress, width: int, runs: int) -> bool:
+def _compute(engine: Engine, store: Store, todo: list[int], workers: int, batch: int, bar: Progress, runs: int) -> bool:
     """Compute and keep the blocks; True when Ctrl-C cut it short (blocks under way are still kept)."""
-    steps_each = len(engine.names)
-    task = bar.add(f"{runs} runs", len(todo) * steps_each)
-    queue = list(todo)
-    pending: set[Future] = set()
-    interrupted = False
-    failure: BaseException | None = None
+    task = bar.add(f"{runs} runs", len(todo) * len(engine.names))
+    stop = False
 
-    def job(index: int) -> None:
-        store.save(engine.compute(index, lambda: bar.advance(task)), engine.experiment)
+    def job(indices: list[int]) -> None:
+        for index in indices:
+            if stop:
+                return
+            store.save(engine.compute(index, lambda: bar.advance(task)), engine.experiment)
 
+    each = max(1, -(-batch // engine.experiment.width))
+    queue = [todo[i : i + each] for i in range(0, len(todo), each)]
     with ThreadPoolExecutor(workers) as pool:
-        while queue or pending:
-            try:
-                while queue and len(pending) < workers and failure is None:
-                    pending.add(pool.submit(job, queue.pop(0)))
-                if not pending:
-                    break
-                done, pending = wait(pending, return_when=FIRST_COMPLETED)
-                for future in done:
-                    failure = failure or future.exception()
-            except KeyboardInterrupt:
-                interrupted, queue = True, []
+
+        def halt() -> None:
+            nonlocal stop
+            stop = True
+
+        interrupted, failure = _drain(queue, lambda piece: pool.submit(job, piece), workers, lambda _: None, halt)
+    return _settled(store, engine.experiment.width, failure, interrupted, bar, task)
+
+
+def _compute_on_dask(
+    experiment: Experiment, names: list[str], address: str, store: Store, todo: list[int], bar: Progress, runs: int
+) -> bool:
+    """As `_compute`, with the blocks computed by the workers of a Dask cluster and kept here."""
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise CampaignError('--dask needs the extra: pip install "helmstar[dask]"') from error
+    task = bar.add(f"{runs} runs on {address}", len(todo))
+    try:
+        client = Client(address, timeout=10)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise CampaignError(f"--dask {address}: no scheduler answers there ({error})") from error
+    with client, client.get_executor(pure=False) as pool:
+        spec = experiment.spec.model_dump(mode="json")
+
+        def keep(block: Block) -> None:
+            store.save(block, experiment)
+            bar.advance(task)
+
+        def submit(piece: list[int]) -> Future:
+            return pool.submit(compute_block, experiment.name, spec, tuple(names), piece[0])
+
+        ahead = 2 * max(1, sum(client.nthreads().values()))
+        interrupted, failure = _drain([[i] for i in todo], submit, ahead, keep, lambda: None)
+    return _settled(store, experiment.width, failure, interrupted, bar, task)
+
+
+def _drain(
+    queue: list[list[int]],
+    submit: Callable[[list[int]], Future],
+    ahead: int,
+    keep: Callable[[Any], None],
+    halt: Callable[[], None],
+) -> tuple[bool, BaseException | None]:
+    """Work the queue with `ahead` pieces under way; whether Ctrl-C came, and the first failure. Nothing new is begun after
+    either, and what is under way is waited for and kept."""
+    pending: set[Future] = set()
+    interrupted, failure = False, None
+    while queue or pending:
+        try:
+            while queue and len(pending) < ahead and failure is None:
+                pending.add(submit(queue.pop(0)))
+            if not pending:
+                break
+            done, pending = wait(pending, return_when=FIRST_COMPLETED)
+            for future in done:
+                error = future.exception()
+                if error is None:
+                    keep(future.result())
+                failure = failure or error
+        except KeyboardInterrupt:
+            interrupted = True
+            queue.clear()
+            halt()
+    return interrupted, failure
+
+
+def _settled(
+    store: Store, width: int, failure: BaseException | None, interrupted: bool, bar: Progress, task: Any
+) -> bool:
     if failure is not None:
         kept = len(store.finished()) * width
         raise CampaignError(f"a block failed: {failure}; {kept} runs are kept in {store.folder}") from failure
-    bar.finish(task)
+    if not interrupted:
+        bar.finish(task)
     return interrupted

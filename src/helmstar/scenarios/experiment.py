@@ -34,6 +34,7 @@ class Experiment(Protocol):
 
     name: str
     title: str
+    spec: Any
     width: int
     time: np.ndarray
     simulate: Call

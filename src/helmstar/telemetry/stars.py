@@ -44,15 +44,17 @@ def direction_epochs(rows: DirectionRows, sigma: float | None, probability: floa
             message = "a star whose direction does not fit the other stars of its time"
             problems.append(Problem(rows.files[rows.file[i]], int(rows.row[i]), "jump", message, "dropped"))
         mask &= ~bad
-        solution = _solve(star_B, star_N, mask)
-    q, cov, misfit, dof = solution
+        left = mask.any(axis=1)
+        first, star_B, star_N, mask = first[left], star_B[left], star_N[left], mask[left]
+        solution = _solve(star_B, star_N, mask) if bad.any() else solution
     one = np.argmax(mask, axis=1)
     here = np.arange(len(first))
+    q, cov, misfit, dof = solution
     epochs = Epochs(
         rows.time[first], q, cov, rows.file[first], rows.row[first], rows.files,
         star_B[here, one], star_N[here, one], misfit, dof,
     )  # fmt: skip
-    return epochs.select(mask.any(axis=1)), problems
+    return epochs, problems
 
 
 def _solve(star_B: np.ndarray, star_N: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, ...]:
