@@ -25,7 +25,7 @@ from helmstar.geometry import quaternion
 DTYPES = [np.float64, np.float32]
 N = 16  # every batch has this length, so that each program compiles once for each dtype
 program = partial(jax.jit, compiler_options=COMPILER_OPTIONS)
-LAW = settings(deadline=None, derandomize=True, max_examples=50)
+LAW = settings(deadline=None, derandomize=True, max_examples=30)
 
 ANGLES = [0.0, 1e-300, 1e-160, 1e-37, 1e-30, 1e-19, 1e-12, 1e-8, 1e-5, 1e-3]
 ANGLES += [0.1993, 0.3, 0.9999999, 1.0000001, 2.0, 3.0]  # the series end at 0.1993 and at 1
@@ -326,10 +326,9 @@ def test_double_cover(dtype, q, v):
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("factor", [1e-15, 1e-3, 1.0, 1e3, 1e15])
 @LAW
-@given(unit_quaternions())
-def test_normalise_keeps_direction(factor, dtype, q):
+@given(unit_quaternions(), st.sampled_from([1e-15, 1e-3, 1.0, 1e3, 1e15]))
+def test_normalise_keeps_direction(dtype, q, factor):
     """A sum of four squares, a root, a division: 4. The result is again unchanged, but for its last bit."""
     q = (q * factor).astype(dtype)
     unit = normalise(q)

@@ -26,7 +26,7 @@ from helmstar.geometry import so3
 DTYPES = [np.float64, np.float32]
 N = 16  # every batch has this length, so that each program compiles once for each dtype
 program = partial(jax.jit, compiler_options=COMPILER_OPTIONS)
-LAW = settings(deadline=None, derandomize=True, max_examples=50)
+LAW = settings(deadline=None, derandomize=True, max_examples=30)
 
 TINY = [0.0, 1e-300, 1e-160, 1e-37, 1e-30, 1e-19]
 SMALL = [1e-12, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3]

@@ -71,7 +71,7 @@ def bridge(signal: Clean, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarr
             known[length] = _stretches(signal, length)
         lively = _liveliness(signal, a, b, (last[g] - first[g])[None])[0]
         possible = [
-            w for w in known[length].errors if signal.is_clean(a - w, a)[0] and signal.is_clean(b, b + w)[0] or w == 0.0
+            w for w in known[length].errors if (signal.is_clean(a - w, a)[0] and signal.is_clean(b, b + w)[0]) or w == 0.0
         ]
         window, sigma[g] = _judge(known[length], possible, lively, spread)
         if window > 0.0:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -43,8 +42,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Estimates:
-    """At each instant of the timeline: q_BN (n, 4), drift (n, 3) rad/s, sigma (n, 6) rad and rad/s, cross covariance left out;
-    cov (n, 6, 6)."""
+    """At each instant of the timeline: q_BN (n, 4), drift (n, 3) rad/s, cov (n, 6, 6) in rad and rad/s, axes of B."""
 
     q_BN: np.ndarray
     drift: np.ndarray
@@ -54,7 +52,7 @@ class Estimates:
 @dataclass(frozen=True)
 class Updates:
     """Of each epoch of the timeline after the first: index (k,) into the timeline, nis, dof, status, residual (k, 3) in rad
-    in B (NaN for star directions), its sigma (k, 3), log likelihood."""
+    in B (NaN for a single star direction), its sigma (k, 3)."""
 
     index: np.ndarray
     nis: np.ndarray
@@ -65,16 +63,16 @@ class Updates:
 
 
 def model_of(levels: NoiseLevels, directions: bool) -> Model:
-    """The 6-state model with the sensor that the record has."""
-    sensor = unit_star_directions(levels.sigma) if directions else whole_attitude()
-    return attitude_drift_model(GyroNoise(jnp.asarray(levels.sigma_v), jnp.asarray(levels.sigma_u)), sensors=(sensor,))
+    """The 6-state model with whole attitudes and, where an epoch has nothing else, single star directions."""
+    sensors = (whole_attitude(), unit_star_directions(levels.sigma)) if directions else (whole_attitude(),)
+    return attitude_drift_model(GyroNoise(jnp.asarray(levels.sigma_v), jnp.asarray(levels.sigma_u)), sensors=sensors)
 
 
-@partial(jax.jit, static_argnames=())
+@jax.jit
 def _forward(
-    model: Model, belief: Gaussian, refused: Array, u: GyroInput, dt: Array, m: Measurement, gate: Gate
+    model: Model, belief: Gaussian, refused: Array, u: GyroInput, dt: Array, m: tuple[Measurement, ...], gate: Gate
 ) -> Any:
-    return run(FILTER, model, belief, u, dt, (m,), gate, refused)
+    return run(FILTER, model, belief, u, dt, m, gate, refused)
 
 
 @jax.jit
@@ -86,33 +84,32 @@ def _backward(track: Any, following: Predicted, later: Gaussian) -> Gaussian:
 
 
 class Record:
-    """A timeline with its measurements, cut into padded chunks."""
+    """A timeline with its measurements, cut into padded chunks; `used` (m,) says which epochs enter."""
 
     def __init__(self, timeline: Timeline, epochs: Epochs, levels: NoiseLevels, used: np.ndarray):
         self.timeline, self.epochs, self.levels = timeline, epochs, levels
         self.steps = len(timeline.time) - 1
         self.chunks = max(1, -(-self.steps // CHUNK))
         self.used = used
-        self.directions = epochs.star_B is not None
+        self.single = bool(np.any(~epochs.solved & used))
 
-    def chunk(self, i: int) -> tuple[GyroInput, Array, Measurement]:
+    def chunk(self, i: int) -> tuple[GyroInput, Array, tuple[Measurement, ...]]:
         """Inputs, step lengths and measurements of chunk i."""
         a, b = i * CHUNK, min((i + 1) * CHUNK, self.steps)
         t = self.timeline
         pad = CHUNK - (b - a)
         dt = np.pad(np.diff(t.time[a : b + 1]), (0, pad))
         rate = np.pad(t.rate[a:b], ((0, pad), (0, 0)))
-        extra = np.pad(t.extra[a:b], (0, pad))[:, None, None] * np.eye(3)
+        extra = np.pad(t.extra[a:b], ((0, pad), (0, 0)))[:, :, None] * np.eye(3)
         number = np.pad(t.epoch[a + 1 : b + 1], (0, pad), constant_values=-1)
-        present = (number >= 0) & self.used[np.maximum(number, 0)]
         e, j = self.epochs, np.maximum(number, 0)
-        if e.star_B is not None and e.star_N is not None and e.mask is not None:
-            m = Measurement(
-                jnp.asarray(e.star_B[j]), jnp.asarray(e.star_N[j]), jnp.asarray(e.mask[j] & present[:, None])
-            )
-        else:
-            R = e.shape[j] * self.levels.sigma**2
-            m = Measurement(jnp.asarray(e.q_BN[j]), jnp.asarray(R), jnp.asarray(present[:, None]))
+        present = (number >= 0) & self.used[j]
+        solved = e.solved[j]
+        R = e.shape[j] * self.levels.sigma**2
+        m = (Measurement(jnp.asarray(e.q_BN[j]), jnp.asarray(R), jnp.asarray((present & solved)[:, None])),)
+        if self.single and e.star_B is not None and e.star_N is not None:
+            star_B, star_N = jnp.asarray(e.star_B[j][:, None]), jnp.asarray(e.star_N[j][:, None])
+            m = (*m, Measurement(star_B, star_N, jnp.asarray((present & ~solved)[:, None])))
         return GyroInput(jnp.asarray(rate), jnp.asarray(extra)), jnp.asarray(dt), m
 
     def length(self, i: int) -> int:
@@ -134,8 +131,8 @@ def filter_and_smooth(
 
     `advance` is called after each chunk of both passes (2 * record.chunks times).
     """
-    model = model_of(record.levels, record.directions)
-    belief, refused = initial_belief(start), jnp.zeros(1, dtype=int)
+    model = model_of(record.levels, record.single)
+    belief, refused = initial_belief(start), jnp.zeros(len(model.sensors), dtype=int)
     begins, kept, infos = [], [_first(belief)], []
     for i in range(record.chunks):
         begins.append((belief, refused))
@@ -143,7 +140,7 @@ def filter_and_smooth(
         belief, refused, track = _forward(model, belief, refused, u, dt, m, gate)
         n = record.length(i)
         kept.append(_numbers(track.belief, n))
-        infos.append(_info(track.infos[0], n))
+        infos.append(_info(track.infos, n))
         advance()
     filtered = _joined(kept)
     smoothed = _smooth(record, model, begins, belief, gate, advance)
@@ -185,14 +182,21 @@ def _joined(parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Estimates
     return Estimates(q, b, P)
 
 
-def _info(info: Any, n: int) -> tuple[np.ndarray, ...]:
-    S = np.diagonal(np.asarray(info.S), axis1=1, axis2=2)
-    return tuple(np.asarray(a)[:n] for a in (info.nis, info.dof, info.status, info.residual)) + (np.sqrt(S)[:n],)
+def _info(infos: tuple[Any, ...], n: int) -> tuple[np.ndarray, ...]:
+    """nis, dof, status, residual and its sigma of each step by the sensor that has a measurement there."""
+    whole = infos[0]
+    S = np.asarray(whole.S)[:n]
+    sigma = np.sqrt(np.maximum(np.diagonal(S, axis1=1, axis2=2), 0.0))
+    out = [np.asarray(a)[:n] for a in (whole.nis, whole.dof, whole.status, whole.residual)] + [sigma]
+    for single in infos[1:]:
+        here = np.asarray(single.dof)[:n] > 0
+        for k, name in enumerate(("nis", "dof", "status")):
+            out[k] = np.where(here, np.asarray(getattr(single, name))[:n], out[k])
+        out[3], out[4] = (np.where(here[:, None], np.nan, a) for a in out[3:])
+    return tuple(out)
 
 
 def _updates(record: Record, infos: list[tuple[np.ndarray, ...]]) -> Updates:
     nis, dof, status, residual, sigma = (np.concatenate(x) for x in zip(*infos, strict=True))
     at = np.flatnonzero(dof > 0)
-    if record.directions:
-        residual = sigma = np.full((len(nis), 3), np.nan)
     return Updates(at + 1, nis[at], dof[at], status[at], residual[at], sigma[at])

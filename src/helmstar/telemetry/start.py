@@ -169,24 +169,25 @@ class _Window:
         return inverse @ self.y[i, j], np.sqrt(np.diagonal(inverse @ cov @ inverse.T))
 
     def agreeing(self, limit: float) -> np.ndarray:
-        """Which attitudes (n,) agree with the guess that most agree with; of equals that with the smallest distances, and of
-        two attitudes against one (nothing but the drift tells them apart) that with the smallest drift."""
+        """Which attitudes (n,) agree with the best guess: the one of largest likelihood, with distances cut at `limit`; when
+        none agrees with a third attitude, nothing but the drift tells them apart, and the smallest is taken."""
         n = len(self.t)
-        best: tuple[int, float, np.ndarray] = (-1, np.inf, np.ones(n, dtype=bool))
+        best, agreeing = (np.inf, np.inf), np.ones(n, dtype=bool)
         for i in range(n):
             for j in range(i + 1, n):
                 b, _ = self.drift(i, j)
-                distance = self._distances(i, j, b)
+                distance, log_det = self._distances(i, j, b)
                 right = distance <= limit
                 right[[i, j]] = True
-                others = int(right.sum()) - 2
-                merit = float(np.sum(distance[right])) if others else float(np.linalg.norm(b))
-                if (others, -merit) > (best[0], -best[1]):
-                    best = (others, merit, right)
-        return best[2]
+                others = np.setdiff1d(np.arange(n), [i, j])
+                cost = float(np.sum(np.minimum(distance, limit)[others] + log_det[others]))
+                merit = (cost, 0.0) if right.sum() > 2 else (1e300, float(np.linalg.norm(b)))
+                if merit < best:
+                    best, agreeing = merit, right
+        return agreeing
 
-    def _distances(self, i: int, j: int, b: np.ndarray) -> np.ndarray:
-        """Chi-square (n,) of each attitude against the guess from i and j with the drift b; 0 for these two."""
+    def _distances(self, i: int, j: int, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Chi-square (n,) of each attitude against the guess from i and j with the drift b, and its covariance's log det."""
         s, tau = self.t[j] - self.t[i], self.t - self.t[i]
         m = (tau / s)[:, None]
         c1, c2 = np.abs(self.c - self.c[i]), np.abs(self.c[j] - self.c[i])
@@ -199,5 +200,4 @@ class _Window:
         cov = cov + walk[:, :, None] * np.eye(3)
         d = self.y[i] - np.einsum("kab,b->ka", self.A - self.A[i], b)
         distance = np.einsum("ka,ka->k", d, np.linalg.solve(cov, d[..., None])[..., 0])
-        distance[[i, j]] = 0.0
-        return distance
+        return distance, np.linalg.slogdet(cov)[1]

@@ -1,0 +1,259 @@
+"""From a record's rows to its estimates: screen, find the start, find the noise, filter forward, smooth backward."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..backend import jnp
+from ..core import ACCEPTED, Gate
+from ..errors import DataError
+from ..io.problems import Problem, refuse
+from ..io.screening import screen_gyro
+from ..io.telemetry import AttitudeRows, GyroRows, Telemetry, to_rates
+from ..progress import Progress
+from ..sensors.configuration import SensorsConfiguration
+from .estimate import Estimates, Record, Start, Updates, filter_and_smooth
+from .noise import EPOCHS, NAMES, NoiseLevels, estimate_noise, rough_levels
+from .rates import RateSignal, rate_signal
+from .stars import direction_epochs
+from .start import DIFFUSE, Beginning, Between, drifts, find_beginning, integrate_between, intervals
+from .timeline import Epochs, Timeline, attitude_epochs, build_timeline, reachable
+
+ARCSEC = np.pi / 180.0 / 3600.0
+NOT_USED = "not used"
+"""Action on rows that are good but of no use here: neither rejected nor an error when reading is strict."""
+LARGEST_DOF = 8
+
+
+@dataclass(frozen=True)
+class Solution:
+    """All that was estimated of one record. `gyro`: the rows that were used; `used` (m,): the epochs that entered."""
+
+    gyro: GyroRows
+    timeline: Timeline
+    epochs: Epochs
+    used: np.ndarray
+    filtered: Estimates
+    smoothed: Estimates
+    updates: Updates
+    levels: NoiseLevels
+    sources: dict[str, str]
+    start: Start
+    start_source: str
+    problems: tuple[Problem, ...]
+    gate: Gate
+
+
+def solve(
+    telemetry: Telemetry, sensors: SensorsConfiguration, strict: bool = False, progress: bool = False
+) -> Solution:
+    """Filter and smooth a record.
+
+    Raises DataError when the rows do not suffice, or, with `strict`, when one of them is bad.
+    """
+    problems = list(telemetry.problems)
+
+    def check() -> None:
+        if strict:
+            refuse([p for p in problems if p.action != NOT_USED])
+
+    with Progress(progress) as bar:
+        task = bar.add("reading", 1)
+        gyro, signal, epochs = _inputs(telemetry, sensors, problems)
+        check()
+        epochs = _within(signal, epochs, problems)
+        bar.finish(task)
+        task = bar.add("start and noise", 2)
+        gate = chi_square_gate(sensors.filter.gate_probability, sensors.filter.reopen_after)
+        epochs, used, beginning, levels, sources = _begin(signal, epochs, sensors, gate, problems)
+        bar.advance(task)
+        start, start_source = _start(sensors, epochs, levels, beginning)
+        timeline = build_timeline(signal, epochs)
+        bar.finish(task)
+        record = Record(timeline, epochs, levels, used)
+        task = bar.add("filter and smoother", 2 * record.chunks)
+        filtered, smoothed, updates = filter_and_smooth(record, start, gate, lambda: bar.advance(task))
+        bar.finish(task)
+    if not all(np.isfinite(x).all() for e in (filtered, smoothed) for x in (e.q_BN, e.drift, e.cov)):
+        raise DataError("the filter did not stay finite; check the noise in sensors.toml against the data's units")
+    problems += _refused(timeline, epochs, updates, gate)
+    check()
+    return Solution(
+        gyro, timeline, epochs, used, filtered, smoothed, updates, levels, sources, start, start_source,
+        tuple(problems), gate,
+    )  # fmt: skip
+
+
+def chi_square_gate(probability: float, reopen_after: int) -> Gate:
+    """Gate for up to LARGEST_DOF degrees of freedom that refuses a consistent measurement with `probability`; 0 refuses none.
+
+    As `core.chi_square_gate`, without loading scipy.stats, which takes longer than filtering an hour of data.
+    """
+    from scipy.special import gammainccinv
+
+    dof = np.arange(1, LARGEST_DOF + 1)
+    limits = 2.0 * gammainccinv(0.5 * dof, probability) if probability > 0.0 else np.full(len(dof), np.inf)
+    return Gate(limits=jnp.asarray(np.concatenate([[0.0], limits])), reopen_after=jnp.asarray(reopen_after))
+
+
+def _inputs(
+    telemetry: Telemetry, sensors: SensorsConfiguration, problems: list[Problem]
+) -> tuple[GyroRows, RateSignal, Epochs]:
+    """Gyro rows, their rate signal and star epochs on one clock, with bad rows screened out."""
+    gyro, attitude, directions = telemetry.gyro, telemetry.attitude, telemetry.directions
+    gyro = replace(gyro, time=gyro.time + sensors.gyro.time_offset_s)
+    if len(attitude):
+        if directions is not None:
+            message = "star directions are not used beside whole attitudes"
+            problems.append(
+                Problem(directions.files[0], int(directions.row[0]), "unused", message, NOT_USED, len(directions))
+            )
+        attitude = replace(attitude, time=attitude.time + sensors.star.time_offset_s)
+        shape = sensors.star.covariance_B()
+        epochs = attitude_epochs(attitude, np.eye(3) if shape is None else shape)
+    elif directions is not None:
+        directions = replace(directions, time=directions.time + sensors.star.time_offset_s)
+        sigma_S = sensors.star.sigma_S
+        epochs, found = direction_epochs(
+            directions, None if sigma_S is None else float(sigma_S[0]), sensors.filter.gate_probability
+        )
+        problems += found
+    else:
+        raise DataError("no usable attitude or star row; give q_bn_x, _y, _z, _w or star_b_x ... with star_n_x ...")
+    whole = epochs.select(epochs.solved)
+    arbiter = AttitudeRows(whole.time, whole.file, whole.row, whole.files, whole.q_BN)
+    gyro, found = screen_gyro(gyro, arbiter, sensors.gyro.reading)
+    problems += found
+    if len(gyro) < 2:
+        name = ", ".join(gyro.files) or "telemetry"
+        raise DataError(f"{name}: {len(gyro)} usable gyro rows; at least 2 are needed")
+    rates, reading = to_rates(gyro, sensors.gyro.reading)
+    increments = gyro.quantity == "increment" or sensors.gyro.reading == "increment_rad"
+    return gyro, rate_signal(rates.time, rates.value, rates.step, reading, increments), epochs
+
+
+def _within(signal: RateSignal, epochs: Epochs, problems: list[Problem]) -> Epochs:
+    """The epochs that the gyro reaches, from the first that has an attitude."""
+    reach = reachable(signal, epochs)
+    solved = reach & epochs.solved
+    low, high = signal.span
+    names = ", ".join(dict.fromkeys(epochs.files[i] for i in np.unique(epochs.file)))
+    if solved.sum() < 2 <= epochs.solved.sum():
+        raise DataError(
+            f"{names}: {int(solved.sum())} of {int(epochs.solved.sum())} attitudes within the gyro data ({low:.3f} to "
+            f"{high:.3f} s after the first row); at least 2 are needed. Do both tables use the same clock? See time_offset_s"
+        )
+    if solved.sum() < 2:
+        hint = ""
+        if epochs.directions:
+            hint = "; a time with at least two stars, well apart, gives an attitude: stars seen together need equal times"
+        raise DataError(f"{names}: {int(solved.sum())} attitudes; at least 2 are needed{hint}")
+    first = int(np.flatnonzero(solved)[0])
+    early = reach & (np.arange(len(epochs)) < first)
+    _note(problems, epochs, early, "early", "single stars before the first attitude cannot start a filter")
+    _note(problems, epochs, ~reach, "no_gyro", "star measurements before the first or after the last gyro row")
+    return epochs.select(reach & ~early)
+
+
+def _note(problems: list[Problem], epochs: Epochs, which: np.ndarray, kind: str, message: str) -> None:
+    """One entry for each file that has epochs in a mask, which are good but of no use."""
+    for i in np.unique(epochs.file[which]):
+        row = epochs.row[which & (epochs.file == i)]
+        problems.append(Problem(epochs.files[i], int(row.min()), kind, message, NOT_USED, len(row)))
+
+
+def _begin(
+    signal: RateSignal, epochs: Epochs, sensors: SensorsConfiguration, gate: Gate, problems: list[Problem]
+) -> tuple[Epochs, np.ndarray, Beginning, NoiseLevels, dict[str, str]]:
+    """Epochs from the first right one on, which of them to use, the beginning, the noise levels and where these come from."""
+    timeline = build_timeline(signal, epochs)
+    solved, limit = epochs.solved, float(np.asarray(gate.limits)[3])
+    between = integrate_between(timeline, epochs, solved, np.zeros(3))
+    # Once more without the drift: what is left is small, and first order suffices.
+    drift = np.median(drifts(between, epochs), axis=0)
+    between = integrate_between(timeline, epochs, solved, drift)
+    drift = np.median(drifts(between, epochs), axis=0)
+
+    known = _known(sensors, epochs)
+    everything = np.ones(len(epochs), dtype=bool)
+    levels = rough_levels(intervals(between, epochs, drift, everything), known)
+    beginning = find_beginning(between, epochs, levels, limit)
+    if len(known) < len(NAMES):
+        good = everything.copy()
+        good[beginning.wrong] = False
+        stretches = [intervals(_from(between, beginning.epoch), epochs, drift, good)]
+        if len(stretches[0]) > EPOCHS:
+            take = np.flatnonzero(solved & good & (np.arange(len(epochs)) >= beginning.epoch))
+            far = np.zeros(len(epochs), dtype=bool)
+            far[take[:: -(-(len(take) - 1) // EPOCHS)]] = True
+            stretches.append(intervals(integrate_between(timeline, epochs, far, drift), epochs, drift, good))
+        levels = estimate_noise(stretches, known, gate, _misfit(epochs))
+        beginning = find_beginning(between, epochs, levels, limit)
+
+    message = "a jump: this attitude does not agree with the gyro and the attitudes that follow"
+    for i in beginning.wrong:
+        problems.append(Problem(epochs.files[epochs.file[i]], int(epochs.row[i]), "jump", message, "dropped"))
+    used = np.ones(len(epochs), dtype=bool)
+    used[beginning.wrong] = False
+    from_here = np.arange(beginning.epoch, len(epochs))
+    few = len(between.duration) < 8
+    sources = {n: "sensors.toml" if n in known else "estimated from the data" for n in NAMES}
+    if few and "sigma_u" not in known:
+        sources["sigma_u"] = "taken as 0: too few attitudes to tell"
+    return epochs.select(from_here), used[from_here], beginning, levels, sources
+
+
+def _from(between: Between, epoch: int) -> Between:
+    """The part that begins with an epoch."""
+    i = int(np.flatnonzero(between.epochs == epoch)[0])
+    return replace(
+        between, epochs=between.epochs[i:], time=between.time[i:], turn=between.turn[i:], J=between.J[i:],
+        extra=between.extra[i:],
+    )  # fmt: skip
+
+
+def _known(sensors: SensorsConfiguration, epochs: Epochs) -> dict[str, float]:
+    """The noise levels that the configuration states."""
+    sigma_S = sensors.star.sigma_S
+    sigma = None if sigma_S is None else float(sigma_S[0]) if epochs.directions else 1.0
+    given = {"sigma_v": sensors.gyro.arw, "sigma_u": sensors.gyro.rrw, "sigma": sigma}
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def _misfit(epochs: Epochs) -> tuple[float, float]:
+    """Sum of squares by which star directions miss their epochs' solutions, and its degrees of freedom."""
+    if epochs.misfit is None or epochs.misfit_dof is None:
+        return 0.0, 0.0
+    return float(epochs.misfit.sum()), float(epochs.misfit_dof.sum())
+
+
+def _start(
+    sensors: SensorsConfiguration, epochs: Epochs, levels: NoiseLevels, beginning: Beginning
+) -> tuple[Start, str]:
+    """The belief at the first epoch, and where its drift comes from."""
+    cov = epochs.shape[0] * levels.sigma**2
+    given = sensors.gyro.initial_drift_sigma
+    if given is None:
+        return Start(epochs.q_BN[0], cov, beginning.drift, DIFFUSE * beginning.sigma), "first two attitudes minus the gyro"
+    # A drift far less known than two attitudes tell it is best linearised about what they tell.
+    vague = given > DIFFUSE * float(np.max(beginning.sigma))
+    return Start(epochs.q_BN[0], cov, beginning.drift if vague else np.zeros(3), np.full(3, given)), "sensors.toml"
+
+
+def _refused(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate) -> list[Problem]:
+    """Measurements that the gate did not take."""
+    limits = np.asarray(gate.limits)
+    out = []
+    for k in np.flatnonzero(updates.status != ACCEPTED):
+        e = int(timeline.epoch[updates.index[k]])
+        off = np.linalg.norm(updates.residual[k]) / ARCSEC
+        where = f"{off:.4g} arcsec from what the gyro leads to, " if np.isfinite(off) else ""
+        limit = limits[updates.dof[k]]
+        message = f"a jump: {where}NIS {updates.nis[k]:.4g} over the gate's {limit:.4g}"
+        out.append(Problem(epochs.files[epochs.file[e]], int(epochs.row[e]), "jump", message, "dropped"))
+    return out
+
+
+__all__ = ["ARCSEC", "NOT_USED", "Solution", "solve"]
