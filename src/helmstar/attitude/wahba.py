@@ -64,8 +64,9 @@ def _prepare(b: Any, r: Any, sigma: Any, mask: Any, xp: ModuleType) -> tuple[Any
     return b, r, xp.where(mask, weight, xp.zeros_like(weight))
 
 
-def _quaternion(R: Any, xp: ModuleType) -> Any:
-    """q_BN of R_BN: the column of 4 q q^T with the largest diagonal, normalised."""
+def quaternion_of_matrix(R: Any) -> Any:
+    """q_BN (..., 4) of R_BN (..., 3, 3): the column of 4 q q^T with the largest diagonal, normalised."""
+    xp = _namespace(R)
     d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     x, y, z = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
     xy, xz, yz = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
@@ -140,5 +141,5 @@ def svd(b: Any, r: Any, sigma: Any = 1.0, mask: Any = None) -> WahbaSolution:
     U, _, Vt = xp.linalg.svd(xp.where(ok[..., None, None], Bm, xp.zeros_like(Bm)))
     sign = xp.sign(xp.linalg.det(U) * xp.linalg.det(Vt))
     R = xp.concatenate([U[..., :, :2], U[..., :, 2:] * sign[..., None, None]], axis=-1) @ Vt
-    q = xp.where(ok[..., None], _quaternion(R, xp), xp.asarray(xp.nan, dtype=b.dtype))
+    q = xp.where(ok[..., None], quaternion_of_matrix(R), xp.asarray(xp.nan, dtype=b.dtype))
     return _finish(q, b, r, a, xp)

@@ -41,6 +41,7 @@ class Store:
     def __init__(self, folder: Path, manifest: dict[str, Any], resume: bool):
         self.folder = folder
         self.blocks = folder / "blocks"
+        self._kept: dict[int, xr.Dataset] = {}  # of this process: what was just written need not be read again
         self.manifest = manifest | {"fingerprint": fingerprint(manifest)}
         path = folder / "campaign.json"
         try:
@@ -81,6 +82,7 @@ class Store:
         part = path.with_suffix(".part")
         ds.to_netcdf(part, engine="h5netcdf")
         os.replace(part, path)
+        self._kept[block.index] = ds
 
     def load(self, indices: Iterable[int], runs: int) -> xr.Dataset | None:
         """Blocks joined along run, cut to run numbers below `runs`; None when there is none.
@@ -89,6 +91,9 @@ class Store:
         """
         parts: list[xr.Dataset] = []
         for i in indices:
+            if i in self._kept:
+                parts.append(self._kept[i])
+                continue
             path = self.blocks / f"{i:06d}.nc"
             try:
                 with xr.open_dataset(path, engine="h5netcdf") as ds:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..attitude import svd
+from ..attitude import quaternion_of_matrix, svd
 from ..backend import jax, jnp
 from ..core import Gaussian, Measurement, Model, no_gate, pytree
 from ..evaluate import recursive_bound
@@ -285,9 +285,7 @@ def truth_of(spec: Specification) -> rigid_body.RigidBodyTruth:
         return a * np.cos(f * s)
 
     time = np.arange(spec.updates + 1) * spec.step_s
-    from scipy.spatial.transform import Rotation
-
-    q0 = Rotation.from_matrix(np.array(t.attitude)).as_quat()
+    q0 = quaternion_of_matrix(np.array(t.attitude, dtype=float))
     if t.rate == "prescribed":
         return rigid_body.simulate(time, q0, "printed", rate=rate)
     J = np.diag(t.inertia_kg_m2)
