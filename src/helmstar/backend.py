@@ -9,6 +9,7 @@ Every other module takes `jax` and `jnp` from here, so that no array exists befo
 from __future__ import annotations
 
 import os
+from typing import Any
 
 # One thread for each computation: small batched matrices lose more to splitting than they gain (measured: twice the CPU
 # time). Parallelism is over blocks of runs instead, one Python thread each. XLA reads NPROC when its client starts.
@@ -42,7 +43,22 @@ def _enable_compilation_cache() -> None:
 
 _enable_compilation_cache()
 
-COMPILER_OPTIONS = {"xla_backend_optimization_level": 1}
-"""For `lowered.compile(...)` and `jax.jit`: a third less compile time than XLA's default level at the same speed."""
+COMPILER_OPTIONS: dict[str, bool | int | str] = {
+    "xla_backend_optimization_level": 1,
+    "xla_cpu_use_fusion_emitters": False,
+}
+"""For `compile_program` and `jax.jit`: a third to a half of the compile time of XLA's defaults at about the same speed
+(docs/performance.md)."""
 
-__all__ = ["COMPILER_OPTIONS", "jax", "jnp"]
+
+def compile_program(lowered: Any) -> Any:
+    """The executable of a lowered program, by COMPILER_OPTIONS where this version of XLA knows them."""
+    try:
+        return lowered.compile(COMPILER_OPTIONS)
+    except Exception as error:  # XLA names no narrower type
+        if "option" not in str(error).lower():
+            raise
+        return lowered.compile()
+
+
+__all__ = ["COMPILER_OPTIONS", "compile_program", "jax", "jnp"]

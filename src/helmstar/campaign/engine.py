@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..backend import COMPILER_OPTIONS, jax, jnp
+from ..backend import compile_program, jax, jnp
 from ..scenarios.experiment import Call, Experiment
 
 _PROGRAMS: dict[Any, Any] = {}
@@ -66,7 +66,7 @@ class Engine:
 
         def job(key: Any) -> tuple[Any, Any]:
             call, data = self._jobs[key]
-            return key, call.function.lower(*call.arguments, data, **call.static).compile(COMPILER_OPTIONS)
+            return key, compile_program(call.function.lower(*call.arguments, data, **call.static))
 
         with ThreadPoolExecutor(workers) as pool:
             for future in as_completed([pool.submit(job, key) for key in self._missing()]):
