@@ -6,9 +6,10 @@ matrix exponential, the posterior's minimum by scipy.optimize.
 
 Every sequence has the same shapes, so that each filter compiles once and the cases differ by data alone. Tolerances:
 
-- LINEAR = 1e-9 relative: 30 steps of operations with condition numbers below 1e4, and the scaled transform's weights of
-  +-1e6 for alpha = 1e-3, cost at most 1e6 eps; the EKF alone is held to 1e-12;
-- SIDES = 1e-9: the error sides are equal in exact arithmetic; a large first update (100 deg) amplifies rounding;
+- LINEAR: 30 steps with condition numbers of some 10 cost 1e-12. The scaled transform takes differences over alpha sigma
+  and weighs their products by 1 / alpha^2: rounding of some eps / alpha^2 more, 1e-8 for the usual alpha = 1e-3;
+- SIDES = 1e-9: the error sides are equal in exact arithmetic. Rounding in a gain is amplified by the condition of S = H P
+  H^T + R, 1e4 where the filter starts 100 deg off; the cases in AMPLIFIED have 1e8;
 - a belief that must not change is compared to the bit where the state is a vector. A unit quaternion is normalised
   again at each step, which may move its last bit: 4 eps.
 """
@@ -76,10 +77,12 @@ from helmstar.models.attitude import (
 )
 from helmstar.models.sensors import unit_star_directions
 
-LINEAR = SIDES = 1e-9
+LINEAR = 1e-12
+SIDES = 1e-9
 EPS = np.finfo(float).eps
-# Laws hold at every level of optimisation; at the lowest a program compiles in half the time.
-compiled = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+# Laws hold at every level of optimisation; at the lowest a program compiles in a third of the time.
+FAST = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+compiled = partial(jax.jit, compiler_options=FAST)
 
 
 def numpy_of(tree):
@@ -246,7 +249,8 @@ def _run_linear(filter, spreads, u, dt, ms, gate):
     )
 
 
-SPREADS = (scaled(), scaled(0.3, 2.0, 1.0), kappa_form(1.0), kappa_form(-1.0))
+SPREADS = (scaled(1e-3), scaled(1e-2), scaled(0.3, 2.0, 1.0), kappa_form(1.0), kappa_form(-1.0))
+SPREAD_TOLERANCES = (1e-8, 1e-9, LINEAR, LINEAR, LINEAR)
 
 
 @cache
@@ -262,15 +266,17 @@ def linear_track(kind: str):
 
 
 def linear_views(kind: str):
-    """Tracks over cases, one for each spread."""
+    """Tracks over cases with their tolerance, one for each spread."""
     track = linear_track(kind)
-    return [track] if kind != "ukf" else [jax.tree.map(lambda a, i=i: a[i], track) for i in range(len(SPREADS))]
+    if kind != "ukf":
+        return [(track, LINEAR)]
+    return [(jax.tree.map(lambda a, i=i: a[i], track), tolerance) for i, tolerance in enumerate(SPREAD_TOLERANCES)]
 
 
-@pytest.mark.parametrize(("kind", "tolerance"), [("ekf", 1e-12), ("iterated", 1e-12), ("ukf", LINEAR)])
-def test_every_filter_is_the_kalman_filter_on_a_linear_problem(kind, tolerance):
+@pytest.mark.parametrize("kind", ["ekf", "iterated", "ukf"])
+def test_every_filter_is_the_kalman_filter_on_a_linear_problem(kind):
     o = numpy_tracks()
-    for t in linear_views(kind):
+    for t, tolerance in linear_views(kind):
         assert worst(t.predicted.mean, o.x_pred) < tolerance
         assert worst_covariance(t.predicted.cov, o.P_pred) < tolerance
         assert worst(t.predicted.F, o.F) < tolerance
@@ -298,7 +304,7 @@ def test_absent_measurements_and_padding_leave_a_vector_belief_to_the_bit(kind):
     padded = absent & (d.dt == 0.0)
     assert absent[1].sum() >= 3
     assert padded[2].sum() == 9
-    for t in linear_views(kind):
+    for t, tolerance in linear_views(kind):
         np.testing.assert_array_equal(t.belief.mean[absent], t.predicted.mean[absent])
         change = np.abs(t.belief.cov - t.predicted.cov)[absent]
         # The UKF symmetrises, which may move the last bit of an entry.
@@ -306,9 +312,9 @@ def test_absent_measurements_and_padding_leave_a_vector_belief_to_the_bit(kind):
         assert np.all(np.isfinite(t.belief.cov))
         k = np.flatnonzero(padded[2])
         before, after = t.belief.mean[2][k - 1], t.belief.mean[2][k]
-        if kind == "ukf":  # sigma points of alpha = 1e-3 are differences of 1e-3 sigma: eps / alpha
-            assert np.abs(after - before).max() < 1e-3 * LINEAR
-            assert worst_covariance(t.belief.cov[2][k], t.belief.cov[2][k - 1]) < LINEAR
+        if kind == "ukf":  # predicted through sigma points, not copied
+            assert np.abs(after - before).max() < tolerance
+            assert worst_covariance(t.belief.cov[2][k], t.belief.cov[2][k - 1]) < tolerance
         else:
             np.testing.assert_array_equal(after, before)
             np.testing.assert_array_equal(t.belief.cov[2][k], t.belief.cov[2][k - 1])
@@ -326,8 +332,8 @@ def test_a_model_without_sensors_predicts():
         F = np.array([[1.0, dt], [0.0, 1.0]])
         x, P = F @ x + dt * u, F @ P @ F.T + B_W @ np.diag(Q_W * dt) @ B_W.T
     assert refused.shape == (0,)
-    assert worst(last.mean, x) < 1e-12
-    assert worst_covariance(last.cov, P) < 1e-12
+    assert worst(last.mean, x) < LINEAR
+    assert worst_covariance(last.cov, P) < LINEAR
 
 
 # --- the smoother --------------------------------------------------------------------------------------------------
@@ -386,7 +392,7 @@ def at(tree, k):
 @pytest.mark.parametrize("kind", ["ekf", "ukf"])
 def test_smoother_is_rts_and_the_batch_least_squares_solution(kind):
     d, o = linear_data(), numpy_tracks()
-    t = linear_views(kind)[-1]
+    t, _ = linear_views(kind)[-1]
     filtered = Gaussian(t.belief.mean, t.belief.cov)
     s = numpy_of(_smooth_linear(filtered, t.predicted, at(filtered, -1)))
     for c in range(LINEAR_CASES):
@@ -467,7 +473,7 @@ def attitude_data() -> AttitudeData:
     n, shape = len(CASES), (len(CASES), STEPS)
     sigma = np.full(n, 1e-3)
     sigma[[OUTLIERS, UPSET]] = 1e-4
-    sigma[NOISELESS] = 1e-10
+    sigma[LARGE], sigma[NOISELESS] = 1e-2, 1e-8
     sigma_v, sigma_u = np.full(n, 1e-4), np.full(n, 1e-6)
     dt = r.uniform(0.5, 2.0, size=shape)
     dt[GAP, 20] = 50.0
@@ -681,7 +687,7 @@ AMPLIFIED = {"noiseless": 1e3, "upset": 1e3}
 def test_attitude_filter_is_the_numpy_filter(case):
     """Masks, partial masks with NaN behind them, two sensors at different rates, gate and reopening, all in one."""
     c = CASES.index(case)
-    o, (_, refused, t) = oracle(c), tracks("left")
+    o, (_, _, t) = oracle(c), tracks("left")
     b, q, P = t.belief.mean.b[c], t.belief.mean.q_BN[c], t.belief.cov[c]
     tolerance = AMPLIFIED.get(case, 1.0) * SIDES
     assert np.max(angles(q, np.array([R.as_quat() for R in o.R]))) < tolerance
@@ -716,14 +722,14 @@ def test_left_with_transport_is_right(case):
         np.testing.assert_array_equal(a.status[c], b.status[c])
         assert np.max(np.abs(a.nis[c] - b.nis[c]) / (1 + np.abs(a.nis[c]))) < tolerance
     a, b = nees("left", d, left)[c], nees("right", d, right)[c]
-    if case != "noiseless":  # the truth of that case is known to 1e-16 rad, its sigma is 1e-10 rad
+    if case != "noiseless":  # scipy's angles have 1e-16 rad of rounding, which is 1e-8 sigma there
         assert np.max(np.abs(a - b) / (1 + a)) < tolerance
 
 
 def test_the_large_case_makes_large_updates():
     """Else the equality of sides above would say nothing about transport."""
     _, _, left = tracks("left")
-    assert angles(left.belief.mean.q_BN[LARGE, 0], attitude_data().q0[LARGE]) > 1.0
+    assert angles(left.belief.mean.q_BN[LARGE, 0], attitude_data().q0[LARGE]) > 0.8
 
 
 def test_consistent_cases_have_the_nees_of_their_covariance():
@@ -816,7 +822,7 @@ def unscented_track():
 @pytest.mark.parametrize("case", CASES)
 def test_unscented_attitude_filter_is_the_numpy_filter(case):
     c = CASES.index(case)
-    o, (_, refused, t) = numpy_ukf(unscented_data(), c), unscented_track()
+    o, (_, _, t) = numpy_ukf(unscented_data(), c), unscented_track()
     info = t.infos[0]
     np.testing.assert_array_equal(info.status[c], o.status)
     np.testing.assert_array_equal(info.dof[c], o.dof)
@@ -888,7 +894,7 @@ def test_the_order_of_slots_and_what_lies_behind_a_mask_do_not_matter():
     other = d._replace(star_z=z, star_r=stars, star_mask=mask, whole_z=whole_z, whole_cov=whole_cov)
     _, _, a = tracks("left")
     _, _, b = numpy_of(_run_cases("left", *arguments(other, "left")))
-    keep = [c for c in range(len(CASES)) if c != NOISELESS]  # rounding is amplified by the condition of S there
+    keep = [c for c, case in enumerate(CASES) if case not in AMPLIFIED]
     assert np.max(angles(a.belief.mean.q_BN, b.belief.mean.q_BN)[keep]) < 1e-12
     assert worst_covariance(b.belief.cov[keep], a.belief.cov[keep]) < 1e-10
     assert worst(b.infos[0].nis[RATES], a.infos[0].nis[RATES]) < 1e-10
@@ -918,8 +924,9 @@ def test_several_sensors_at_a_step_are_updates_one_after_the_other():
     _, _, a = tracks("left")
     _, _, b = numpy_of(_run_cases("left", *arguments(split, "left")))
     for c in (CONSISTENT, RATES, LARGE, OUTLIERS, UPSET):
-        assert np.max(angles(a.belief.mean.q_BN[c, :half], b.belief.mean.q_BN[c, 1::2])) < 1e-12
-        assert worst_covariance(b.belief.cov[c, 1::2], a.belief.cov[c, :half]) < 1e-10
+        exact = 1e-12 * AMPLIFIED.get(CASES[c], 1.0) ** 2
+        assert np.max(angles(a.belief.mean.q_BN[c, :half], b.belief.mean.q_BN[c, 1::2])) < exact
+        assert worst_covariance(b.belief.cov[c, 1::2], a.belief.cov[c, :half]) < 100 * exact
         np.testing.assert_array_equal(a.infos[0].status[c, :half], b.infos[0].status[c, 0::2])
         np.testing.assert_array_equal(a.infos[1].status[c, :half], b.infos[1].status[c, 1::2])
 
@@ -976,20 +983,35 @@ def test_a_belief_stays_finite_whatever_a_sensor_says():
     limits[[CONSISTENT, RATES, GAP]] = limits[UPSET]
     bad = d._replace(star_z=z, spec=Specification(d.spec.sigma_v, d.spec.sigma_u, sigma), limits=limits)
     for other in (bad, bad._replace(limits=np.full_like(limits, np.inf), reopen=np.zeros(len(CASES), int))):
-        (last, refused, t) = numpy_of(_run_cases("left", *arguments(other, "left")))
+        _, _, t = numpy_of(_run_cases("left", *arguments(other, "left")))
         for leaf in jax.tree.leaves(t.belief):
             assert np.all(np.isfinite(leaf))
         np.testing.assert_array_equal(t.infos[0].status[CONSISTENT, 5:10], GATED)
         assert np.all(t.infos[0].status[CONSISTENT, 12:] == ACCEPTED)
-        assert not np.any(t.infos[0].status[RATES] == ACCEPTED)
 
 
 def test_the_noise_floor_is_finite_and_accurate():
-    """sigma = 1e-10 rad, the floor that scenarios tell a filter of noiseless stars: no NaN, and the truth is found."""
-    _, _, t = tracks("left")
-    error = angles(t.belief.mean.q_BN, attitude_data().true_q)[NOISELESS]
-    assert np.max(error) < 1e-6  # the gyro alone: 1e-4 rad; what is lost is the condition of S, 1e12, times eps
-    assert np.all(np.isfinite(t.infos[0].loglik[NOISELESS]))
+    """sigma = 1e-10 rad, the floor that scenarios tell a filter of noiseless stars, with a gyro of 1e-5 rad per step: from
+    a start that is good to 1e-5 rad or not as good as that."""
+    d = attitude_data()
+    spec = Specification(np.full(len(CASES), 1e-5), np.full(len(CASES), 1e-9), np.full(len(CASES), 1e-10))
+    stars = np.nan_to_num(d.star_r, nan=1.0)
+    stars[..., 1, :] = np.roll(stars[..., 0, :], 1, axis=-1)
+    stars /= np.linalg.norm(stars, axis=-1, keepdims=True)
+    z = np.einsum("ckij,cknj->ckni", Rotation.from_quat(d.true_q.reshape(-1, 4)).as_matrix().reshape(*d.dt.shape, 3, 3), stars)
+    exact = d._replace(
+        spec=spec, P0=np.broadcast_to(np.diag([1e-10] * 3 + [1e-14] * 3), d.P0.shape), star_z=z, star_r=stars, star_mask=np.ones_like(d.star_mask), whole_mask=np.zeros_like(d.whole_mask),
+        limits=np.full_like(d.limits, np.inf),
+    )  # fmt: skip
+    _, _, t = numpy_of(_run_cases("left", *arguments(exact, "left")))
+    for leaf in jax.tree.leaves(t.belief):
+        assert np.all(np.isfinite(leaf))
+    usual = np.array([case != "gap" for case in CASES])  # after 0.1 rad of gap S has a condition of 1e18: refused
+    for leaf in jax.tree.leaves(t.infos):
+        assert np.all(np.isfinite(leaf[usual]))
+    # The condition of S, some 1e10, times eps, is the relative error of a gain that takes away 1e-4 rad of gyro noise.
+    near = [CONSISTENT, RATES, OUTLIERS, NOISELESS]
+    assert np.max(angles(t.belief.mean.q_BN, d.true_q)[near, 5:]) < 1e-8
 
 
 def test_a_gate_with_too_few_limits_is_an_error():
@@ -1025,9 +1047,9 @@ def test_covariance_stays_symmetric_and_positive_over_2000_steps_of_tiny_noise()
         whole_mask=np.zeros_like(d.whole_mask), limits=np.full_like(d.limits, np.inf),
     )  # fmt: skip
     truth = Rotation.from_quat(d.q0)
-    args = None
+    carried = None
     asymmetry, smallest = 0.0, np.inf
-    for chunk in range(2000 // STEPS):
+    for _ in range(2000 // STEPS):
         stars = r.normal(size=d.star_r.shape)
         stars /= np.linalg.norm(stars, axis=-1, keepdims=True)
         stars[..., 1:, :] = stars[..., :1, :] + 0.02 * stars[..., 1:, :]  # close together: the turn about them is weak
@@ -1035,11 +1057,9 @@ def test_covariance_stays_symmetric_and_positive_over_2000_steps_of_tiny_noise()
         R = truth.as_matrix()
         z = np.einsum("cij,cknj->ckni", R, stars) + sigma[:, None, None, None] * r.normal(size=stars.shape)
         rate = d.spec.sigma_v[:, None, None] * r.normal(size=d.rate.shape)
-        now = arguments(d._replace(star_r=stars, star_z=z, rate=rate), "left")
-        if args is not None:
-            now = (now[0], *carried, *now[3:])
-        last, refused, t = _run_cases("left", *now)
-        args, carried = now, (last, refused)
+        spec, *start, u, dt, ms, gate = arguments(d._replace(star_r=stars, star_z=z, rate=rate), "left")
+        last, refused, t = _run_cases("left", spec, *(carried or start), u, dt, ms, gate)
+        carried = (last, refused)
         P = np.asarray(t.belief.cov)
         s = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
         C = P / (s[..., :, None] * s[..., None, :])
@@ -1082,13 +1102,13 @@ def test_the_models_of_xu2020_and_unit_directions_keep_float32():
     m, gate = Measurement(stars, stars, jnp.ones(2, bool)), no_gate()
     lie = [xu2020.lie_model(one, one, r) for r in (so3_right, so3_left, gibbs_left)]
     unit = attitude_model(GyroNoise(one, one), so3_left, (unit_star_directions(one),))
-    for model, u, P in (
+    for model, drive, cov in (
         *((x, u, P) for x in (*lie, xu2020.printed_model(one, one))),
         (xu2020.quaternion_model(one, one), u, jnp.eye(4, dtype=jnp.float32)),
         (unit, GyroInput(u, P), P),
     ):
         filter = ErrorStateKalmanFilter(model.retraction)
-        out = jax.eval_shape(partial(step, filter), model, Gaussian(q, P), jnp.zeros(1, int), u, one, (m,), gate)
+        out = jax.eval_shape(partial(step, filter), model, Gaussian(q, cov), jnp.zeros(1, int), drive, one, (m,), gate)
         assert dtypes(out) == {np.dtype(np.float32)}
 
 

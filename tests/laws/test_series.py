@@ -39,6 +39,7 @@ CASES = {
     "jacobian_inverse_coefficient": (_jacobian_inverse, 1.0, 12, 24),
 }
 COMPILED = {n: (jax.jit(getattr(series, n)), jax.jit(jax.vmap(jax.grad(getattr(series, n))))) for n in CASES}
+SECOND = {n: jax.jit(jax.vmap(jax.hessian(getattr(series, n)))) for n in CASES}
 ATAN = jax.jit(series.atan_ratio)
 ATAN_GRADIENT = jax.jit(jax.vmap(jax.grad(series.atan_ratio, argnums=(0, 1))))
 
@@ -90,6 +91,20 @@ def test_value_and_derivative_match_exact_arithmetic(name, dtype):
     small = t2 < threshold
     beside = np.where(small, 0.0, np.abs(f0) / np.where(small, 1.0, t2))
     close(derivative(t2), f1, derivative_ulps, np.abs(f1) + np.abs(t2 * f2) + beside)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", CASES)
+def test_second_derivative_is_exact_in_the_series_and_finite_outside(name, dtype):
+    """Hessians at 0 need it. 8: two derivatives of a polynomial, whose coefficients grow by the square of their number."""
+    f, threshold, *_ = CASES[name]
+    t2 = arguments(dtype)
+    second = np.asarray(SECOND[name](t2))
+    assert second.dtype == dtype
+    assert np.all(np.isfinite(second))
+    t2, second = t2[t2 < threshold], second[t2 < threshold]
+    expected = exact(f, t2)[2]
+    close(second, expected, 8, np.abs(expected))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -71,7 +71,7 @@ def to_matrix(q: Array) -> Array:
 
 @jax.jit
 def from_matrix(R: Array) -> Array:
-    """Unit quaternion of R. 4 q q^T is linear in R; its column with the largest diagonal is taken and normalised.
+    """Unit quaternion of R. 4 q q^T is linear in R; a column with a large diagonal is taken and normalised.
 
     No square root of a difference is taken, so the result and its gradient are accurate at every angle, pi included.
     """
@@ -81,8 +81,8 @@ def from_matrix(R: Array) -> Array:
     z = jnp.stack([r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1.0 - r[0, 0] - r[1, 1] + r[2, 2], r[1, 0] - r[0, 1]], axis=-1)
     w = jnp.stack([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1.0 + r[0, 0] + r[1, 1] + r[2, 2]], axis=-1)
     # A compiler may evaluate a comparison again for each of its uses, with products and sums contracted differently. At
-    # a tie (q_x = q_z: symmetric axes are common) derivatives then mix two columns and are wrong by as much as they are
-    # large; seen in XLA at optimisation level 0. The weights move the ties to where no one goes.
+    # a tie (q_x = q_z, as for symmetric axes) derivatives then mix two columns and are wrong by as much as they are
+    # large: seen in XLA at optimisation level 0. The weights move the ties to where no one goes.
     dx, dy, dz, dw = x[..., 0], 1.13 * y[..., 1], 1.29 * z[..., 2], 1.47 * w[..., 3]
     xy = jnp.where((dx >= dy)[..., None], x, y)
     zw = jnp.where((dz > dw)[..., None], z, w)

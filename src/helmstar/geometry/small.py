@@ -22,9 +22,9 @@ def symmetrise(P: Array) -> Array:
 
 @jax.jit
 def cholesky(A: Array) -> Array:
-    """Lower L with L L^T = A for symmetric positive definite A (..., n, n); NaN where A is not positive definite.
+    """Lower L with L L^T = A for symmetric positive definite A (..., n, n); NaN where a pivot is negative.
 
-    Only the lower triangle of A is read.
+    Only the lower triangle of A is read. A last pivot of exactly zero is a zero in L: solving with it is not finite.
     """
     n = A.shape[-1]
     rows: list[list[Array]] = []
