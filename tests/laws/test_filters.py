@@ -90,7 +90,7 @@ def numpy_of(tree):
 
 
 def worst(actual, expected) -> float:
-    """Largest difference relative to the largest entry of each leading index's array; a NaN is infinitely wrong."""
+    """Largest difference relative to the largest entry; a NaN is infinitely wrong."""
     a, b = np.asarray(actual, float), np.asarray(expected, float)
     assert a.shape == b.shape
     scale = np.max(np.abs(b), initial=1e-300)
@@ -991,27 +991,26 @@ def test_a_belief_stays_finite_whatever_a_sensor_says():
 
 
 def test_the_noise_floor_is_finite_and_accurate():
-    """sigma = 1e-10 rad, the floor that scenarios tell a filter of noiseless stars, with a gyro of 1e-5 rad per step: from
+    """sigma = 1e-10 rad, the floor that scenarios tell a filter of noiseless stars, with a gyro a million times worse: from
     a start that is good to 1e-5 rad or not as good as that."""
     d = attitude_data()
-    spec = Specification(np.full(len(CASES), 1e-5), np.full(len(CASES), 1e-9), np.full(len(CASES), 1e-10))
-    stars = np.nan_to_num(d.star_r, nan=1.0)
-    stars[..., 1, :] = np.roll(stars[..., 0, :], 1, axis=-1)
+    spec = Specification(np.full(len(CASES), 1e-4), np.full(len(CASES), 1e-9), np.full(len(CASES), 1e-10))
+    stars = np.random.default_rng(13).normal(size=d.star_r.shape)
+    stars[..., 1, :] = np.cross(stars[..., 0, :], stars[..., 1, :])
     stars /= np.linalg.norm(stars, axis=-1, keepdims=True)
-    z = np.einsum("ckij,cknj->ckni", Rotation.from_quat(d.true_q.reshape(-1, 4)).as_matrix().reshape(*d.dt.shape, 3, 3), stars)
+    R = Rotation.from_quat(d.true_q.reshape(-1, 4)).as_matrix().reshape(*d.dt.shape, 3, 3)
+    P0 = np.broadcast_to(np.diag([1e-10] * 3 + [1e-14] * 3), d.P0.shape)
     exact = d._replace(
-        spec=spec, P0=np.broadcast_to(np.diag([1e-10] * 3 + [1e-14] * 3), d.P0.shape), star_z=z, star_r=stars, star_mask=np.ones_like(d.star_mask), whole_mask=np.zeros_like(d.whole_mask),
-        limits=np.full_like(d.limits, np.inf),
+        spec=spec, P0=P0, star_z=np.einsum("ckij,cknj->ckni", R, stars), star_r=stars, limits=np.full_like(d.limits, np.inf),
+        star_mask=np.ones_like(d.star_mask), whole_mask=np.zeros_like(d.whole_mask), extra=np.zeros_like(d.extra),
+        dt=np.minimum(d.dt, 2.0),
     )  # fmt: skip
     _, _, t = numpy_of(_run_cases("left", *arguments(exact, "left")))
-    for leaf in jax.tree.leaves(t.belief):
+    for leaf in jax.tree.leaves(t):
         assert np.all(np.isfinite(leaf))
-    usual = np.array([case != "gap" for case in CASES])  # after 0.1 rad of gap S has a condition of 1e18: refused
-    for leaf in jax.tree.leaves(t.infos):
-        assert np.all(np.isfinite(leaf[usual]))
-    # The condition of S, some 1e10, times eps, is the relative error of a gain that takes away 1e-4 rad of gyro noise.
+    # The condition of S, some 1e12, times eps, is the relative error of a gain that takes away 1e-4 rad of gyro noise.
     near = [CONSISTENT, RATES, OUTLIERS, NOISELESS]
-    assert np.max(angles(t.belief.mean.q_BN, d.true_q)[near, 5:]) < 1e-8
+    assert np.max(angles(t.belief.mean.q_BN, d.true_q)[near, 5:]) < 1e-7
 
 
 def test_a_gate_with_too_few_limits_is_an_error():

@@ -53,10 +53,13 @@ def _namespace(*arrays: Any) -> ModuleType:
 def _prepare(b: Any, r: Any, sigma: Any, mask: Any, xp: ModuleType) -> tuple[Any, Any, Any]:
     """Unit directions and weights 1/sigma^2 with the masked entries replaced before any arithmetic."""
     b, r = xp.asarray(b), xp.asarray(r)
-    if b.shape[-1] != 3 or r.shape[-1] != 3 or b.shape[-2] != r.shape[-2]:
+    if b.ndim < 2 or r.ndim < 2 or b.shape[-1] != 3 or r.shape[-1] != 3 or b.shape[-2] != r.shape[-2]:
         raise ValueError(f"b {b.shape} and r {r.shape}: must be (..., n, 3) with the same n")
     n = b.shape[-2]
     mask = xp.ones(n, dtype=bool) if mask is None else xp.asarray(mask)
+    for name, shape in (("mask", mask.shape), ("sigma", np.shape(sigma) or (n,))):
+        if shape[-1:] != (n,):
+            raise ValueError(f"{name} {shape}: must have one entry for each of the {n} directions")
     axis = xp.asarray([1.0, 0.0, 0.0], dtype=b.dtype)
     b, r = (xp.where(mask[..., None], v, axis) for v in (b, r))
     b, r = (v / xp.sqrt(xp.sum(v * v, axis=-1, keepdims=True)) for v in (b, r))
@@ -80,6 +83,12 @@ def quaternion_of_matrix(R: Any) -> Any:
     best = xp.argmax(xp.stack([K[..., i, i] for i in range(4)], axis=-1), axis=-1)
     q = xp.take_along_axis(K, best[..., None, None], axis=-2)[..., 0, :]
     return q / xp.sqrt(xp.sum(q * q, axis=-1, keepdims=True))
+
+
+def _share(a: Any, xp: ModuleType) -> Any:
+    """Weights over the largest: their scale does not change the attitude. All zero (nothing present) stay zero."""
+    largest = xp.max(a, axis=-1, keepdims=True)
+    return a / xp.where(largest > 0, largest, xp.ones_like(largest))
 
 
 def _finish(q: Any, b: Any, r: Any, a: Any, xp: ModuleType) -> WahbaSolution:
@@ -117,7 +126,7 @@ def davenport(b: Any, r: Any, sigma: Any = 1.0, mask: Any = None) -> WahbaSoluti
     """
     xp = _namespace(b, r, sigma, mask)
     b, r, a = _prepare(b, r, sigma, mask, xp)
-    share = a / xp.max(a, axis=-1, keepdims=True)  # the scale of the weights does not change the attitude
+    share = _share(a, xp)
     Bm = xp.einsum("...n,...ni,...nj->...ij", share, b, r)
     s = xp.trace(Bm, axis1=-2, axis2=-1)
     z = xp.sum(share[..., None] * xp.cross(r, b), axis=-2)
@@ -135,7 +144,7 @@ def svd(b: Any, r: Any, sigma: Any = 1.0, mask: Any = None) -> WahbaSolution:
     """Markley's SVD method; arguments as for `davenport`."""
     xp = _namespace(b, r, sigma, mask)
     b, r, a = _prepare(b, r, sigma, mask, xp)
-    share = a / xp.max(a, axis=-1, keepdims=True)
+    share = _share(a, xp)
     Bm = xp.einsum("...n,...ni,...nj->...ij", share, b, r)
     ok = xp.all(xp.isfinite(Bm), axis=(-2, -1))
     U, _, Vt = xp.linalg.svd(xp.where(ok[..., None, None], Bm, xp.zeros_like(Bm)))

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from ..backend import compile_program, jax, jnp
+from ..backend import jax, jnp
 from ..scenarios.experiment import Call, Experiment
+from .programs import compiled, exported, signature
 
 _PROGRAMS: dict[Any, Any] = {}
 """Compiled programs of this process: a second campaign with other data compiles nothing."""
@@ -33,64 +34,69 @@ class Block:
     seconds: Mapping[str, float]
 
 
-def _shapes(tree: Any) -> tuple:
-    leaves, structure = jax.tree.flatten(tree)
-    return structure, tuple((jnp.shape(a), jnp.result_type(a)) for a in leaves)
-
-
 class Engine:
     """Programs of an experiment for the named estimators."""
 
     def __init__(self, experiment: Experiment, names: Iterable[str]):
         self.experiment = experiment
         self.names = tuple(names)
-        ids = jnp.arange(experiment.width)
-        sim = experiment.simulate
-        self._data_shape = jax.eval_shape(sim.function, *sim.arguments, ids)
-        self._jobs = {self._key(sim, ids): (sim, ids)}
+        # Estimators that differ in data alone share one program.
+        self._jobs: dict[Any, Call] = {self._key(experiment.simulate): experiment.simulate}
         for name in self.names:
             call = experiment.estimators[name]
-            self._jobs.setdefault(self._key(call, self._data_shape), (call, self._data_shape))
+            self._jobs.setdefault(self._key(call), call)
 
-    @staticmethod
-    def _key(call: Call, data: Any) -> Any:
-        return call.function, tuple(sorted(call.static.items())), _shapes((call.arguments, data))
+    def _key(self, call: Call) -> Any:
+        """Of a program within this process. The width stands for the data: they follow from it and the simulation's shapes."""
+        simulation = self.experiment.simulate
+        return (
+            call.function, tuple(sorted(call.static.items())), signature(call.arguments), self.experiment.width,
+            simulation.function, signature(simulation.arguments),
+        )  # fmt: skip
 
     @property
     def programs(self) -> int:
         """How many programs there are still to compile."""
         return len(self._missing())
 
+    def _missing(self) -> list[Any]:
+        return [key for key in self._jobs if key not in _PROGRAMS]
+
     def compile(self, workers: int, done: Callable[[], None] = lambda: None) -> None:
         """Compile all programs, `workers` at a time; `done` is called after each."""
+        missing = self._missing()
+        if not missing:
+            return
+        simulation = self.experiment.simulate
+        ids = jax.ShapeDtypeStruct((self.experiment.width,), jnp.arange(0).dtype)
+        data = jax.eval_shape(simulation.function, *simulation.arguments, ids)
 
         def job(key: Any) -> tuple[Any, Any]:
-            call, data = self._jobs[key]
-            return key, compile_program(call.function.lower(*call.arguments, data, **call.static))
+            call = self._jobs[key]
+            return key, compiled(exported(call, ids if call is simulation else data))
 
         with ThreadPoolExecutor(workers) as pool:
-            for future in as_completed([pool.submit(job, key) for key in self._missing()]):
+            for future in as_completed([pool.submit(job, key) for key in missing]):
                 key, program = future.result()
                 _PROGRAMS[key] = program
                 done()
-
-    def _missing(self) -> list[Any]:
-        return [key for key in self._jobs if key not in _PROGRAMS]
 
     def compute(self, index: int, done: Callable[[], None] = lambda: None) -> Block:
         """One block; `done` is called after each estimator."""
         e = self.experiment
         runs = np.arange(index * e.width, (index + 1) * e.width)
-        ids = jnp.asarray(runs)
-        data = jax.block_until_ready(_PROGRAMS[self._key(e.simulate, ids)](*e.simulate.arguments, ids))
+        simulation = _PROGRAMS[self._key(e.simulate)]
+        data = jax.block_until_ready(simulation(*jax.tree.leaves(e.simulate.arguments), jnp.asarray(runs)))
         arrays, seconds = {}, {}
         for name in self.names:
             call = e.estimators[name]
-            program = _PROGRAMS[self._key(call, self._data_shape)]
+            program = _PROGRAMS[self._key(call)]
             start = time.perf_counter()
-            result = jax.block_until_ready(program(*call.arguments, data))
+            result = jax.block_until_ready(program(*jax.tree.leaves(call.arguments), *data))
             seconds[name] = time.perf_counter() - start
-            arrays[name] = {k: np.asarray(v).astype(e.variables[k].dtype) for k, v in result.items()}
+            # The leaves of a dictionary come in the order of its sorted keys.
+            pairs = zip(sorted(e.variables), result, strict=True)
+            arrays[name] = {k: np.asarray(v).astype(e.variables[k].dtype) for k, v in pairs}
             done()
         return Block(index, runs, arrays, seconds)
 

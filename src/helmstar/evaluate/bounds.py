@@ -14,9 +14,11 @@ import numpy as np
 def recursive_bound(F: np.ndarray, Q: np.ndarray, information: np.ndarray, P0: np.ndarray) -> np.ndarray:
     """Bound (steps, n, n) after each update.
 
-    F, Q, information = H^T R^-1 H: (steps, n, n) or (n, n), at the truth; P0 (n, n) before the first step. Infinite
-    information (a noiseless sensor) gives a zero bound in the directions it sees.
+    F, Q, information = H^T R^-1 H: (steps, n, n) or (n, n), at the truth; P0 (n, n) before the first step, singular
+    allowed. Raises ValueError for infinite information: a noiseless sensor has no bound but zero where it sees.
     """
+    if np.any(np.isinf(information)):
+        raise ValueError("infinite information: a noiseless sensor has no bound but zero where it sees")
     P = np.asarray(P0, float)
     n = P.shape[0]
     steps = max((a.shape[0] for a in (F, Q, information) if np.ndim(a) == 3), default=1)
@@ -33,6 +35,7 @@ def recursive_bound(F: np.ndarray, Q: np.ndarray, information: np.ndarray, P0: n
 
 def steady_state_variance(q: float, r: float, m: np.ndarray | float) -> np.ndarray:
     """Steady-state variance after the update of a random walk with variance q per step, seen m times per step with
-    variance r: p = (-q + sqrt(q^2 + 4 q r / m)) / 2."""
-    m = np.asarray(m, float)
-    return 0.5 * (-q + np.sqrt(q * q + 4.0 * q * r / m))
+    variance r: p = (-q + sqrt(q^2 + 4 q r / m)) / 2, computed without the cancellation of a q that is large."""
+    s = r / np.asarray(m, float)
+    root = q + np.sqrt(q * q + 4.0 * q * s)
+    return 2.0 * q * s / np.where(root > 0.0, root, 1.0)

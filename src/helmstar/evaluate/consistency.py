@@ -32,7 +32,7 @@ def quadratic_form(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
     error, cov = np.asarray(error, float), np.asarray(cov, float)
     ok = np.asarray(np.isfinite(error).all(-1) & np.isfinite(cov).all((-2, -1)))
     safe = np.where(ok[..., None, None], cov, np.eye(cov.shape[-1]))
-    ok &= np.abs(np.linalg.det(safe)) > 0
+    ok &= np.linalg.slogdet(safe).sign != 0  # a determinant itself would underflow
     safe = np.where(ok[..., None, None], safe, np.eye(cov.shape[-1]))
     x = np.linalg.solve(safe, np.where(ok[..., None], error, 0.0)[..., None])[..., 0]
     return np.where(ok, np.sum(np.where(ok[..., None], error, 0.0) * x, axis=-1), np.nan)

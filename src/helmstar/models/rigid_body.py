@@ -13,7 +13,7 @@ The torque that makes a prescribed rate a solution is N = J dw/dt + w x J w.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -61,12 +61,16 @@ def simulate(
 ) -> RigidBodyTruth:
     """Attitude at the given times, driven by a prescribed rate(t), or by Euler's equations from rate0 under torque(t).
 
-    Integrated with scipy's DOP853 at 1e-13 relative. Raises ValueError when neither or both ways are given, or when the
-    integrator fails.
+    Integrated with scipy's DOP853 at 1e-13 relative. Raises ValueError when neither or both ways are given, for another
+    law, for times that are not two or more and increasing, or when the integrator fails.
     """
     from scipy.integrate import solve_ivp
 
+    if law not in get_args(Law):
+        raise ValueError(f"law {law!r}: must be one of {', '.join(map(repr, get_args(Law)))}")
     time = np.asarray(time, float)
+    if time.size < 2 or not np.all(np.diff(time) > 0):
+        raise ValueError("time: must be two or more increasing times in s")
     if rate is not None and torque is None and inertia is None and rate0 is None:
         euler, rate_of, torque_at, J, start = False, rate, rate, np.eye(3), np.empty(0)
     elif rate is None and torque is not None and inertia is not None and rate0 is not None:
@@ -83,7 +87,7 @@ def simulate(
         return np.array([*dq, *(J_inverse @ (torque_at(t) - np.cross(w, J @ w)))])
 
     y0 = np.concatenate([np.asarray(q0, float), start])
-    step = float(np.min(np.diff(time))) if time.size > 1 else np.inf
+    step = float(np.min(np.diff(time)))
     s = solve_ivp(
         derivative, (time[0], time[-1]), y0, method="DOP853", t_eval=time, rtol=1e-13, atol=1e-15, max_step=20 * step
     )

@@ -51,11 +51,11 @@ class Clean:
 @dataclass(frozen=True)
 class _Stretches:
     """Clean stretches of one length: for each way to take the ends, errors (m, 3) of the line's mean; liveliness (m, 3);
-    how many of them do not overlap."""
+    how much a stretch has for itself, as they overlap."""
 
     errors: dict[float, np.ndarray]
     lively: np.ndarray
-    independent: float
+    share: float
 
 
 def bridge(signal: Clean, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -71,7 +71,9 @@ def bridge(signal: Clean, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarr
             known[length] = _stretches(signal, length)
         lively = _liveliness(signal, a, b, (last[g] - first[g])[None])[0]
         possible = [
-            w for w in known[length].errors if (signal.is_clean(a - w, a)[0] and signal.is_clean(b, b + w)[0]) or w == 0.0
+            w
+            for w in known[length].errors
+            if (signal.is_clean(a - w, a)[0] and signal.is_clean(b, b + w)[0]) or w == 0.0
         ]
         window, sigma[g] = _judge(known[length], possible, lively, spread)
         if window > 0.0:
@@ -97,7 +99,6 @@ def _stretches(signal: Clean, length: float) -> _Stretches:
         windows = windows[:1]
     else:
         i, j = i[roomy], j[roomy]
-    independent = max(len(i) * signal.period / length, 1.0)
     every = max(len(i) // STRETCHES, 1)
     i, j = i[::every], j[::every]
     a, b = signal.start[i], signal.end[j]
@@ -106,7 +107,7 @@ def _stretches(signal: Clean, length: float) -> _Stretches:
     errors = {0.0: mean - 0.5 * (tip_a + tip_b)}
     for w in windows[1:]:
         errors[w] = mean - 0.5 * (signal.mean(a - w, a) + signal.mean(b, b + w))
-    return _Stretches(errors, _liveliness(signal, a, b, tip_b - tip_a), independent)
+    return _Stretches(errors, _liveliness(signal, a, b, tip_b - tip_a), min(every * signal.period / length, 1.0))
 
 
 def _slope_window(signal: Clean, length: float) -> float:
@@ -136,7 +137,7 @@ def _judge(
 ) -> tuple[float, np.ndarray]:
     """Of the possible windows (s) the best to average each end over, and 1 sigma (3,) of the mean rate across the gap."""
     if len(stretches.lively) < FEW:  # nothing is known but the rates' spread and what the ends show
-        return 0.0, np.hypot(lively / np.sqrt(12.0), spread)
+        return 0.0, np.hypot(0.5 * lively, spread)
     size, own = np.linalg.norm(stretches.lively, axis=1), float(np.linalg.norm(lively))
     mine = max(own, float(np.median(size)))
     alike = (size >= 0.5 * mine) & (size <= 2.0 * mine)
@@ -149,7 +150,7 @@ def _judge(
             rms = np.sqrt(np.mean(errors[alike] ** 2, axis=0))
             here = np.maximum(rms, np.sqrt(np.sum(rms**2)) * lively / max(own, 1e-300))  # all of it on the lively axis
         else:
-            here = np.maximum(np.sqrt(np.mean(errors**2, axis=0)), lively / np.sqrt(12.0))
+            here = np.maximum(np.sqrt(np.mean(errors**2, axis=0)), 0.5 * lively)
         if np.sum(here**2) < 0.9 * np.sum(sigma**2):
             best, sigma = window, here
-    return best, sigma * np.sqrt(1.0 + 2.0 / stretches.independent)
+    return best, sigma * np.sqrt(1.0 + 2.0 / max(alike.sum() * stretches.share, 1.0))

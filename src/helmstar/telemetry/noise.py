@@ -1,55 +1,42 @@
 """Noise that a configuration does not state, from the data themselves: maximum likelihood over innovations.
 
-The gyro is integrated from epoch to epoch of the stars, and the same 6-state filter runs over epochs for many candidates
-at once; the likelihood of its innovations chooses. First with a Student likelihood that a few outliers cannot move, then,
-with the epochs that the gate refuses left out, with the Gaussian one: so what the gate accepts is consistent.
+On attitudes brought back to one instant by the gyro (`series`) a filter of attitude and drift is linear; it runs for many
+candidates at once, and the likelihood of its innovations chooses. First with a Student likelihood that a few outliers
+cannot move, then, without the epochs that the gate refuses, with the Gaussian one: so what the gate accepts is consistent.
 
-Two stretches are looked at where a record is long: its first epochs, which tell the star tracker from the gyro, and
-epochs far apart over all of it, which tell the walk of the drift.
+Of a long record two selections are looked at: blocks of neighbouring epochs all over it, which tell the star tracker from
+the gyro, and epochs at equal distances, which tell the walk of the drift.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ..backend import jax, jnp
-from ..core import ABSENT, ACCEPTED, Gate, Gaussian, Measurement
+from ..core import Gate
 from ..errors import DataError
-from ..filters import ErrorStateKalmanFilter, run
-from ..geometry import quaternion, so3
-from ..models.attitude import AttitudeDrift, GyroInput, GyroNoise, attitude_drift_model, whole_attitude
+from ..geometry import small
+from .outliers import stand_out
+from .series import Series
 
 Array = jax.Array
 EPOCHS = 512
-"""Intervals of one stretch, the padded length of the one compiled program."""
+"""Intervals of one selection, the padded length of the one compiled program."""
+BLOCKS = 8
+"""Blocks of neighbours that a long record is sampled in."""
 BATCH = 64
 STUDENT = 4.0
 ENOUGH = 8
 """Intervals from which on the likelihood is asked."""
 NAMES = ("sigma_v", "sigma_u", "sigma")
+FLAT = 1.0
+"""Curvature of a log likelihood by the logarithm of a level, below which the data do not tell the level."""
+SIGNS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 SMALLEST = 1e-10
 """Scatter in rad below which data are as exact as their digits."""
-
-
-@dataclass(frozen=True)
-class Intervals:
-    """From epoch to epoch: q_BN (m + 1, 4) measured; shape (m + 1, 3, 3) of their covariance per sigma^2; turn (m, 3): rotation
-    vector phi with R_BN(k+1) = exp(-[phi x]) R_BN(k) by the gyro less a drift; duration (m,) s; extra (m, 3) rad^2; good
-    (m + 1,): which epochs to use, the first among them."""
-
-    q_BN: np.ndarray
-    shape: np.ndarray
-    turn: np.ndarray
-    duration: np.ndarray
-    extra: np.ndarray
-    good: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.duration)
 
 
 @dataclass(frozen=True)
@@ -66,27 +53,49 @@ class NoiseLevels:
 
 @jax.jit
 def _innovations(levels: Array, data: dict[str, Array], gate: Gate) -> tuple[Array, Array, Array]:
-    """For levels (batch, 3): NIS, log det S and status (batch, m) of each epoch after the first."""
+    """For levels (n, 3): NIS and log det S (m, n) of each epoch after the first, and whether the gate refuses it.
 
-    def one(level: Array) -> tuple[Array, Array, Array]:
-        v, u, s = level
-        model = attitude_drift_model(GyroNoise(v, u), sensors=(whole_attitude(),))
-        duration = data["duration"]
-        rate = data["turn"] / jnp.where(duration > 0, duration, 1.0)[:, None]
-        R = data["shape"] * s**2
-        m = Measurement(data["q_BN"][1:], R[1:], data["mask"][:, None])
-        P0 = jnp.zeros((6, 6)).at[:3, :3].set(R[0]).at[3:, 3:].set(data["drift_var"] * jnp.eye(3))
-        belief = Gaussian(AttitudeDrift(data["q_BN"][0], jnp.zeros(3)), P0)
-        inputs = GyroInput(rate, data["extra"][:, :, None] * jnp.eye(3))
-        filter = ErrorStateKalmanFilter(model.retraction)
-        return run(filter, model, belief, inputs, duration, (m,), gate, keep=_keep)[2]
+    State: attitude error theta and drift b, theta' = theta + B b + w, measured y = theta + noise; P = [[Paa, Pab], [Pab^T, Pbb]].
+    """
+    v2, u2, s2 = (levels[:, i, None, None] ** 2 for i in range(3))
+    n, eye = levels.shape[0], jnp.eye(3)
 
-    return jax.vmap(one)(levels)
+    def body(carry, inputs):
+        theta, b, Paa, Pab, Pbb, refused = carry
+        y, B, shape, extra, T, present = inputs
+        Bt = B.T
+        PbbBt = Pbb @ Bt
+        cross = Pab @ Bt
+        Paa = Paa + cross + small.transpose(cross) + B @ PbbBt + (v2 * T + u2 * T**3 / 3.0) * eye + jnp.diag(extra)
+        Pab = Pab + small.transpose(PbbBt) + 0.5 * u2 * T * B
+        Pbb = Pbb + u2 * T * eye
+        theta = theta + b @ Bt
+        V = small.invert_lower(small.cholesky(Paa + s2 * shape))
+        e = jnp.where(present, y - theta, 0.0)
+        white = small.matvec(V, e)
+        nis = jnp.sum(white**2, axis=-1)
+        log_det = -2.0 * jnp.sum(jnp.log(jnp.diagonal(V, axis1=-2, axis2=-1)), axis=-1)
+        over = present & (nis > gate.limits[3])
+        refused = jnp.where(present, jnp.where(over, refused + 1, 0), refused)
+        grow = jnp.where(over & (refused >= gate.reopen_after), nis / 3.0, 1.0)[:, None, None]
+        W = jnp.where((present & ~over)[:, None, None], V, 0.0)
+        Ga, Gb = W @ Paa, W @ Pab  # K = [Ga Gb]^T W
+        Gat, Gbt, white = small.transpose(Ga), small.transpose(Gb), small.matvec(W, e)
+        carry = (
+            theta + small.matvec(Gat, white),
+            b + small.matvec(Gbt, white),
+            (Paa - Gat @ Ga) * grow,
+            (Pab - Gat @ Gb) * grow,
+            (Pbb - Gbt @ Gb) * grow,
+            refused,
+        )
+        return carry, (nis, log_det, over)
 
-
-def _keep(belief: Any, predicted: Any, infos: Any) -> tuple[Array, Array, Array]:
-    i = infos[0]
-    return i.nis, -2.0 * (i.loglik + 0.5 * i.nis + 0.5 * i.dof * jnp.log(2.0 * jnp.pi)), i.status
+    o = jnp.zeros((n, 3, 3))
+    zero = jnp.zeros((n, 3))
+    start = (zero, zero, s2 * data["first"], o, o + data["drift_var"] * eye, jnp.zeros(n, dtype=int))
+    inputs = tuple(data[name] for name in ("y", "B", "shape", "extra", "duration", "mask"))
+    return jax.lax.scan(body, start, inputs)[1]
 
 
 def _gaussian(nis: np.ndarray, log_det: np.ndarray, variance: float | np.ndarray = 1.0) -> np.ndarray:
@@ -99,58 +108,63 @@ def _student(nis: np.ndarray, log_det: np.ndarray, variance: float | np.ndarray 
     return -0.5 * (log_det + 3.0 * np.log(variance) + (STUDENT + 3.0) * np.log1p(nis / variance / STUDENT))
 
 
-def rough_levels(intervals: Intervals, known: dict[str, float]) -> NoiseLevels:
-    """Levels by the scatter of the intervals: all of it given to the stars and to the gyro alike, no walk of the drift.
+def selections(count: int) -> list[np.ndarray]:
+    """Selections of at most EPOCHS + 1 of `count` epochs, each from the first on."""
+    if count <= EPOCHS + 1:
+        return [np.arange(count)]
+    length = EPOCHS // BLOCKS
+    begins = np.linspace(0, count - length, BLOCKS).astype(int)
+    return [np.unique((begins[:, None] + np.arange(length)).ravel()), np.linspace(0, count - 1, EPOCHS + 1).astype(int)]
+
+
+def rough_levels(series: Series, known: dict[str, float]) -> NoiseLevels:
+    """Levels by the scatter from epoch to epoch: all of it given to the stars and to the gyro alike, no walk of the drift.
 
     Raises DataError where nothing is redundant.
     """
     unknown = [n for n in ("sigma_v", "sigma") if n not in known]
-    if unknown and len(intervals) < 2:
+    if unknown and len(series) < 3:
         raise DataError(
             "two attitudes alone do not tell how noisy they are; state the noise in sensors.toml: [gyro] "
             "arw_arcsec_sqrt_s and [star] sigma_arcsec"
         )
-    scatter, T = _scatter(intervals), float(np.median(intervals.duration))
-    mean_shape = float(np.mean(np.trace(intervals.shape, axis1=1, axis2=2)) / 3.0)
-    guess = {"sigma_v": scatter / np.sqrt(T), "sigma_u": 0.0, "sigma": scatter / np.sqrt(mean_shape)}
+    scatter, T = _scatter(series), float(np.median(np.diff(series.time)))
+    guess = {"sigma_v": scatter / np.sqrt(T), "sigma_u": 0.0, "sigma": scatter / np.sqrt(_mean_shape(series))}
     levels = guess | known
     return NoiseLevels(levels["sigma_v"], levels["sigma_u"], levels["sigma"], dict.fromkeys(unknown, np.nan))
 
 
-def _scatter(x: Intervals) -> float:
-    """Robust standard deviation (rad) of gyro against stars over one interval, about the common drift."""
-    e = _differences(x)
-    e = e - np.median(e / x.duration[:, None], axis=0) * x.duration[:, None]
+def _mean_shape(series: Series) -> float:
+    return float(np.mean(np.trace(series.shape, axis1=1, axis2=2)) / 3.0)
+
+
+def _scatter(series: Series) -> float:
+    """Robust standard deviation (rad) of gyro against stars from epoch to epoch, about the common drift."""
+    e, T = series.steps(), np.diff(series.time)[:, None]
+    e = e - np.median(e / T, axis=0) * T
     if len(e) >= ENOUGH:
         return max(1.4826 * float(np.median(np.abs(e))), SMALLEST)
     return max(float(np.sqrt(np.sum(e**2) / (3.0 * max(len(e) - 1, 1)))), SMALLEST)
 
 
-def _differences(x: Intervals) -> np.ndarray:
-    """Measured minus predicted attitude (m, 3) at the end of each interval, rad in B."""
-    predicted = quaternion.multiply(quaternion.exp(-jnp.asarray(x.turn)), jnp.asarray(x.q_BN[:-1]))
-    return np.asarray(quaternion.log(quaternion.multiply(jnp.asarray(x.q_BN[1:]), quaternion.conjugate(predicted))))
-
-
 def estimate_noise(
-    stretches: Sequence[Intervals], known: dict[str, float], gate: Gate, misfit: tuple[float, float] = (0.0, 0.0)
+    series: Series, known: dict[str, float], gate: Gate, misfit: tuple[float, float] = (0.0, 0.0)
 ) -> NoiseLevels:
     """Levels of maximum likelihood; those in `known` ("sigma_v", "sigma_u", "sigma") are kept as they are.
 
-    Of each stretch the first EPOCHS intervals are used. `misfit`: sum of squares by which star directions miss their
-    epochs' solutions, and its degrees of freedom. With too few intervals to tell, the levels are `rough_levels`.
+    What the `gate` refuses does not count. `misfit`: sum of squares by which star directions miss their
+    epochs' solutions, and its degrees of freedom. With too few epochs to tell, the levels are `rough_levels`.
     """
     names = [n for n in NAMES if n not in known]
     if not names:
         return NoiseLevels(known["sigma_v"], known["sigma_u"], known["sigma"], {})
-    first = stretches[0]
-    rough = rough_levels(first, known)
-    if len(first) < ENOUGH:
+    rough = rough_levels(series, known)
+    if len(series) <= ENOUGH:
         return rough
-    likelihood = _Likelihood([_padded(x) for x in stretches], known, names, misfit)
-    scatter, T = _scatter(first), float(np.median(first.duration))
-    total = max(float(x.duration.sum()) for x in stretches)
-    mean_shape = float(np.mean(np.trace(first.shape, axis1=1, axis2=2)) / 3.0)
+    parts = [series.select(index) for index in selections(len(series))]
+    likelihood = _Likelihood([_padded(part) for part in parts], known, names, misfit, gate)
+    scatter, mean_shape = _scatter(series), _mean_shape(series)
+    T, total = float(np.median(np.diff(series.time))), float(series.time[-1] - series.time[0])
     box = {
         "sigma_v": scatter / np.sqrt(T) * np.array([1e-4, 3.0]),
         "sigma_u": scatter * np.array([0.03 / total**1.5, 3.0 / T**1.5]),
@@ -162,24 +176,28 @@ def estimate_noise(
         at = likelihood.with_scale(at)
     else:
         at = _search(lambda p: likelihood(p, _student), bounds, 64 if len(names) == 1 else 16)
-    at, _ = _parabola(lambda p: likelihood(p, _student), at, 0.4, bounds)
+    at, _ = _climb(lambda p: likelihood(p, _student), at, (0.3,), bounds)
     likelihood.leave_out(at, gate)
-    hessian = np.empty((0, 0))
-    for size in (0.6, 0.3, 0.15):
-        at, hessian = _parabola(lambda p: likelihood(p, _gaussian), at, size, bounds)
+    at, hessian = _climb(lambda p: likelihood(p, _gaussian), at, (0.3, 0.2, 0.1, 0.1, 0.1), bounds)
     found = dict(zip(names, np.exp(at), strict=True)) | known
-    uncertainty = {n: float(v) for n, v in zip(names, _uncertainty(hessian), strict=True)}
-    return NoiseLevels(*(float(found[n]) for n in NAMES), uncertainty)
+    shared = np.sqrt(len(parts))  # they look at the same data
+    uncertainty = {n: float(v) for n, v in zip(names, shared * _uncertainty(hessian), strict=True)}
+    return NoiseLevels(float(found["sigma_v"]), float(found["sigma_u"]), float(found["sigma"]), uncertainty)
 
 
 class _Likelihood:
-    """Log likelihoods of points (n, k) in the logarithms of the unknown levels, over all stretches."""
+    """Log likelihoods of points (n, k) in the logarithms of the unknown levels, over all selections."""
 
     def __init__(
-        self, data: list[dict[str, Array]], known: dict[str, float], names: list[str], misfit: tuple[float, float]
+        self,
+        data: list[dict[str, Array]],
+        known: dict[str, float],
+        names: list[str],
+        misfit: tuple[float, float],
+        gate: Gate,
     ):
         self._data, self._known, self._names, self._misfit = data, known, names, misfit
-        self._open = Gate(limits=jnp.full((9,), jnp.inf), reopen_after=jnp.asarray(0))
+        self._open = Gate(limits=jnp.asarray(np.full(len(gate.limits), np.inf)), reopen_after=gate.reopen_after)
 
     def __call__(self, points: np.ndarray, kind: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
         """Log likelihood (n,) by `_gaussian` or `_student`; -inf where it is not finite."""
@@ -211,15 +229,16 @@ class _Likelihood:
         return variance[:, 0], np.where(np.isfinite(value), value, -np.inf)
 
     def _runs(self, levels: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """NIS, log det S and which were used (n, m), for each stretch."""
+        """NIS, log det S and which were used (n, m), for each selection."""
         n = len(levels)
         levels = np.concatenate([levels, np.repeat(levels[-1:], -n % BATCH, axis=0)])
         for data in self._data:
             parts = [
-                _innovations(jnp.asarray(levels[i : i + BATCH]), data, self._open) for i in range(0, len(levels), BATCH)
+                _innovations(jnp.asarray(levels[i : i + BATCH]), data, self._open)[:2]
+                for i in range(0, len(levels), BATCH)
             ]
-            nis, log_det, status = (np.concatenate([np.asarray(a) for a in x])[:n] for x in zip(*parts, strict=True))
-            yield nis, log_det, status != ABSENT
+            nis, log_det = (np.concatenate([np.asarray(a) for a in x], axis=1).T[:n] for x in zip(*parts, strict=True))
+            yield nis, log_det, np.broadcast_to(np.asarray(data["mask"]), nis.shape)
 
     def _levels(self, points: np.ndarray) -> np.ndarray:
         """(n, 3) in the order of NAMES."""
@@ -232,35 +251,35 @@ class _Likelihood:
         )
 
     def leave_out(self, at: np.ndarray, gate: Gate) -> None:
-        """From here on without the epochs that the gate refuses at this point, unless they are too many to be outliers."""
+        """From here on without the epochs that a gate refuses at this point, unless they are too many to be outliers."""
         levels = jnp.asarray(self._levels(np.repeat(at[None], BATCH, axis=0)))
         for i, data in enumerate(self._data):
-            refused = np.asarray(_innovations(levels, data, gate)[2])[0] > ACCEPTED
-            if refused.mean() < 0.2:
-                self._data[i] = data | {"mask": data["mask"] & ~jnp.asarray(refused)}
+            over = np.asarray(_innovations(levels, data, gate)[2])[:, 0]
+            if over.sum() < 0.2 * np.asarray(data["mask"]).sum():
+                self._data[i] = data | {"mask": data["mask"] & ~jnp.asarray(over)}
 
 
-def _padded(x: Intervals) -> dict[str, Array]:
-    """Arrays of EPOCHS intervals."""
-    m = min(len(x), EPOCHS)
+def _padded(series: Series) -> dict[str, Array]:
+    """Arrays of EPOCHS intervals; what is added at the end has no length and is absent."""
+    m = len(series) - 1
+    y, T = series.since(0), np.diff(series.time)
+    size = np.sqrt(np.trace(series.shape, axis1=1, axis2=2) / 3.0)
+    odd = stand_out(y, series.time, size / np.median(size), series.extra.mean(axis=1))
 
-    def pad(a: np.ndarray, n: int) -> Array:
-        return jnp.asarray(np.concatenate([a, np.repeat(a[-1:], n - len(a), axis=0)]))
+    def pad(a: np.ndarray) -> Array:
+        return jnp.asarray(np.concatenate([a, np.zeros((EPOCHS - m, *a.shape[1:]), dtype=a.dtype)]))
 
-    e = np.abs(_differences(x)[:m])
-    T = x.duration[:m]
-    mask = np.zeros(EPOCHS, dtype=bool)
-    mask[:m] = x.good[1 : m + 1]
-    duration = np.zeros(EPOCHS)
-    duration[:m] = T
-    drift_sigma = 10.0 * max(float(np.quantile(e / T[:, None], 0.9)), SMALLEST / float(np.median(T)))
+    shape = np.concatenate([series.shape[1:], np.broadcast_to(np.eye(3), (EPOCHS - m, 3, 3))])
+    e = np.abs(series.steps()) / T[:, None]
+    drift_sigma = 10.0 * max(float(np.quantile(e, 0.9)), SMALLEST / float(np.median(T)))
     return {
-        "q_BN": pad(x.q_BN[: m + 1], EPOCHS + 1),
-        "shape": pad(x.shape[: m + 1], EPOCHS + 1),
-        "turn": pad(x.turn[:m], EPOCHS),
-        "duration": jnp.asarray(duration),
-        "extra": pad(x.extra[:m], EPOCHS),
-        "mask": jnp.asarray(mask),
+        "first": jnp.asarray(series.shape[0]),
+        "y": pad(y[1:]),
+        "B": pad(np.diff(series.A, axis=0)),
+        "shape": jnp.asarray(shape),
+        "extra": pad(np.diff(series.extra, axis=0)),
+        "duration": pad(T),
+        "mask": pad(~odd[1:]),
         "drift_var": jnp.asarray(drift_sigma**2),
     }
 
@@ -277,59 +296,43 @@ def _search(value: Callable[[np.ndarray], np.ndarray], bounds: np.ndarray, count
     return at
 
 
-def _parabola(
-    value: Callable[[np.ndarray], np.ndarray], at: np.ndarray, size: float, bounds: np.ndarray
+def _climb(
+    value: Callable[[np.ndarray], np.ndarray], at: np.ndarray, sizes: Sequence[float], bounds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The top of a parabola fitted to values within `size` of `at`, or the best of these points if it has no top near; its
-    Hessian (k, k)."""
-    k, (low, high) = len(at), bounds.T
-    offsets = np.random.default_rng(0).uniform(-size, size, size=(BATCH - 1, k))
-    points = np.clip(at + np.concatenate([np.zeros((1, k)), offsets]), low, high)
-    values = value(points)
-    d = (points - at) / size
-    pairs = [(i, j) for i in range(k) for j in range(i, k)]
-    design = np.column_stack([np.ones(len(d)), d, *(d[:, i] * d[:, j] for i, j in pairs)])
-    good = np.isfinite(values)
-    if good.sum() < 2 * design.shape[1]:
-        return at, np.full((k, k), np.nan)
-    fit = np.linalg.lstsq(design[good], values[good], rcond=None)[0]
-    hessian = np.zeros((k, k))
-    for (i, j), c in zip(pairs, fit[1 + k :], strict=True):
-        hessian[i, j] += c
-        hessian[j, i] += c
-    best = points[int(np.argmax(np.where(good, values, -np.inf)))]
-    curvature, axes = np.linalg.eigh(hessian)
-    if (curvature < 0.0).all():
-        step = -axes @ ((axes.T @ fit[1 : 1 + k]) / curvature)
-        if np.max(np.abs(step)) <= 2.0:
-            best = np.clip(at + size * step, low, high)
-    return best, hessian / size**2
+    """Newton's method by differences of the given sizes; returns the best point seen and the last Hessian (k, k)."""
+    k = len(at)
+    eye = np.eye(k)
+    pairs = [(i, j) for i in range(k) for j in range(i)]
+    stencil = [0.0 * eye[:1], eye, -eye, *(np.array([a * eye[i] + b * eye[j]]) for i, j in pairs for a, b in SIGNS)]
+    offsets = np.concatenate(stencil)
+    best, hessian = (-np.inf, at), np.full((k, k), np.nan)
+    for size in sizes:
+        points = at + size * offsets
+        v = value(points)
+        if np.nanmax(v) > best[0]:
+            best = (float(np.nanmax(v)), np.clip(points[int(np.nanargmax(v))], *bounds.T))
+        if not np.isfinite(v).all():
+            at = best[1]
+            continue
+        gradient = (v[1 : 1 + k] - v[1 + k : 1 + 2 * k]) / (2.0 * size)
+        hessian = np.diag((v[1 : 1 + k] - 2.0 * v[0] + v[1 + k : 1 + 2 * k]) / size**2)
+        for n, (i, j) in enumerate(pairs):
+            pp, pm, mp, mm = v[1 + 2 * k + 4 * n : 5 + 2 * k + 4 * n]
+            hessian[i, j] = hessian[j, i] = (pp - pm - mp + mm) / (4.0 * size**2)
+        curvature, axes = np.linalg.eigh(hessian)
+        along = axes.T @ gradient
+        newton = along / np.where(curvature < -FLAT, -curvature, 1.0)
+        uphill = np.where(np.abs(along) * size > 0.5 * FLAT, np.sign(along) * size, 0.0)
+        step = axes @ np.clip(np.where(curvature < -FLAT, newton, uphill), -2.0 * size, 2.0 * size)
+        at = np.clip(at + step, *bounds.T)
+    return best[1], hessian
 
 
 def _uncertainty(hessian: np.ndarray) -> np.ndarray:
     """Relative 1 sigma (k,) of each level by the likelihood's curvature; NaN where it has next to none."""
     out = np.full(len(hessian), np.nan)
-    told = np.flatnonzero(np.diagonal(hessian) < -1.0)
+    told = np.flatnonzero(np.diagonal(hessian) < -FLAT)
     if len(told):
         variance = np.diagonal(np.linalg.pinv(-hessian[np.ix_(told, told)]))
         out[told] = np.sqrt(np.where(variance > 0.0, variance, np.nan))
     return out
-
-
-@jax.jit
-def integrate_gyro(rate: Array, dt: Array, restart: Array, q: Array, J: Array) -> tuple[Array, Array]:
-    """Rotation accumulated since the last restart, after each step: q (n, 4) with R_BN = R(q) R_BN(then), and J (n, 3, 3) in s
-    through which a constant drift b acts: R_BN = exp([J b x]) R(q) R_BN(then). restart[k] resets before step k; q (4,)
-    and J (3, 3) are what was accumulated before."""
-
-    def body(carry, inputs):
-        q, J = carry
-        w, dt, again = inputs
-        q = jnp.where(again, quaternion.identity(), q)
-        J = jnp.where(again, jnp.zeros((3, 3)), J)
-        phi = -w * dt
-        q = quaternion.normalise(quaternion.multiply(quaternion.exp(phi), q))
-        J = so3.exp(phi) @ J + so3.left_jacobian(phi) * dt
-        return (q, J), (q, J)
-
-    return jax.lax.scan(body, (q, J), (rate, dt, restart))[1]

@@ -15,10 +15,11 @@ from ..io.telemetry import AttitudeRows, GyroRows, Telemetry, to_rates
 from ..progress import Progress
 from ..sensors.configuration import SensorsConfiguration
 from .estimate import Estimates, Record, Start, Updates, filter_and_smooth
-from .noise import EPOCHS, NAMES, NoiseLevels, estimate_noise, rough_levels
+from .noise import ENOUGH, NAMES, NoiseLevels, estimate_noise, rough_levels
 from .rates import RateSignal, rate_signal
+from .series import bring_back
 from .stars import direction_epochs
-from .start import DIFFUSE, Beginning, Between, drifts, find_beginning, integrate_between, intervals
+from .start import DIFFUSE, Beginning, find_beginning
 from .timeline import Epochs, Timeline, attitude_epochs, build_timeline, reachable
 
 ARCSEC = np.pi / 180.0 / 3600.0
@@ -148,7 +149,9 @@ def _within(signal: RateSignal, epochs: Epochs, problems: list[Problem]) -> Epoc
     if solved.sum() < 2:
         hint = ""
         if epochs.directions:
-            hint = "; a time with at least two stars, well apart, gives an attitude: stars seen together need equal times"
+            hint = (
+                "; a time with at least two stars, well apart, gives an attitude: stars seen together need equal times"
+            )
         raise DataError(f"{names}: {int(solved.sum())} attitudes; at least 2 are needed{hint}")
     first = int(np.flatnonzero(solved)[0])
     early = reach & (np.arange(len(epochs)) < first)
@@ -169,28 +172,17 @@ def _begin(
 ) -> tuple[Epochs, np.ndarray, Beginning, NoiseLevels, dict[str, str]]:
     """Epochs from the first right one on, which of them to use, the beginning, the noise levels and where these come from."""
     timeline = build_timeline(signal, epochs)
-    solved, limit = epochs.solved, float(np.asarray(gate.limits)[3])
-    between = integrate_between(timeline, epochs, solved, np.zeros(3))
+    limit = float(np.asarray(gate.limits)[3])
+    series = bring_back(timeline, epochs, np.zeros(3))
     # Once more without the drift: what is left is small, and first order suffices.
-    drift = np.median(drifts(between, epochs), axis=0)
-    between = integrate_between(timeline, epochs, solved, drift)
-    drift = np.median(drifts(between, epochs), axis=0)
-
+    series = bring_back(timeline, epochs, np.median(series.drifts(), axis=0))
     known = _known(sensors, epochs)
-    everything = np.ones(len(epochs), dtype=bool)
-    levels = rough_levels(intervals(between, epochs, drift, everything), known)
-    beginning = find_beginning(between, epochs, levels, limit)
+    levels = rough_levels(series, known)
+    beginning = find_beginning(series, levels, limit)
     if len(known) < len(NAMES):
-        good = everything.copy()
-        good[beginning.wrong] = False
-        stretches = [intervals(_from(between, beginning.epoch), epochs, drift, good)]
-        if len(stretches[0]) > EPOCHS:
-            take = np.flatnonzero(solved & good & (np.arange(len(epochs)) >= beginning.epoch))
-            far = np.zeros(len(epochs), dtype=bool)
-            far[take[:: -(-(len(take) - 1) // EPOCHS)]] = True
-            stretches.append(intervals(integrate_between(timeline, epochs, far, drift), epochs, drift, good))
-        levels = estimate_noise(stretches, known, gate, _misfit(epochs))
-        beginning = find_beginning(between, epochs, levels, limit)
+        good = (series.epochs >= beginning.epoch) & ~np.isin(series.epochs, beginning.wrong)
+        levels = estimate_noise(series.select(good), known, gate, _misfit(epochs))
+        beginning = find_beginning(series, levels, limit)
 
     message = "a jump: this attitude does not agree with the gyro and the attitudes that follow"
     for i in beginning.wrong:
@@ -198,20 +190,10 @@ def _begin(
     used = np.ones(len(epochs), dtype=bool)
     used[beginning.wrong] = False
     from_here = np.arange(beginning.epoch, len(epochs))
-    few = len(between.duration) < 8
     sources = {n: "sensors.toml" if n in known else "estimated from the data" for n in NAMES}
-    if few and "sigma_u" not in known:
+    if len(series) <= ENOUGH and "sigma_u" not in known:
         sources["sigma_u"] = "taken as 0: too few attitudes to tell"
     return epochs.select(from_here), used[from_here], beginning, levels, sources
-
-
-def _from(between: Between, epoch: int) -> Between:
-    """The part that begins with an epoch."""
-    i = int(np.flatnonzero(between.epochs == epoch)[0])
-    return replace(
-        between, epochs=between.epochs[i:], time=between.time[i:], turn=between.turn[i:], J=between.J[i:],
-        extra=between.extra[i:],
-    )  # fmt: skip
 
 
 def _known(sensors: SensorsConfiguration, epochs: Epochs) -> dict[str, float]:
@@ -236,7 +218,9 @@ def _start(
     cov = epochs.shape[0] * levels.sigma**2
     given = sensors.gyro.initial_drift_sigma
     if given is None:
-        return Start(epochs.q_BN[0], cov, beginning.drift, DIFFUSE * beginning.sigma), "first two attitudes minus the gyro"
+        return Start(
+            epochs.q_BN[0], cov, beginning.drift, DIFFUSE * beginning.sigma
+        ), "first two attitudes minus the gyro"
     # A drift far less known than two attitudes tell it is best linearised about what they tell.
     vague = given > DIFFUSE * float(np.max(beginning.sigma))
     return Start(epochs.q_BN[0], cov, beginning.drift if vague else np.zeros(3), np.full(3, given)), "sensors.toml"

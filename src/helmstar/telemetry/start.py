@@ -1,10 +1,9 @@
 """Where a record's filter starts: the first attitude that agrees with the gyro and its neighbours, and their drift.
 
-Attitudes are brought back to one instant by the gyro alone, D_k = P_k^-1 R_k. Without errors all are equal; with a
-drift b they differ by y_k = log(D_k D_i^-1) = (A_k - A_i) b, A_k = P_k^-1 J_k (see `noise.integrate_gyro`). In a window of the
-first attitudes each pair is taken as a guess of start and drift, and the guess that most others agree with decides which
-of them are right. The filter starts at the first right one with the drift from it to the second, and a sigma ten times
-as wide: so the second attitude counts twice by a hundredth only, and after it the filter has the difference's covariance.
+In a window of the first attitudes, brought back to one instant (`series`), each pair is taken as a guess of start and drift, and
+the guess that most others agree with decides which of them are right. The filter starts at the first right one with the
+drift from it to the second, and a sigma ten times as wide: so the second attitude counts twice by a hundredth only, and
+after it the filter has the difference's covariance.
 """
 
 from __future__ import annotations
@@ -12,12 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from ..backend import jnp
-from ..geometry import quaternion
-from .noise import Intervals, NoiseLevels, integrate_gyro
-from .timeline import Epochs, Timeline
+from .noise import NoiseLevels
+from .series import Series
 
 WINDOW = 12
 """Attitudes that are looked at together."""
@@ -26,79 +22,6 @@ AGREE = 0.6
 WINDOWS = 50
 """Windows that are tried at most."""
 DIFFUSE = 10.0
-STEPS = 4096
-"""Steps of one compiled call of the integration."""
-
-
-@dataclass(frozen=True)
-class Between:
-    """From each solved epoch to the next: numbers (m + 1,) of the epochs and their times (m + 1,); turn q (m, 4) by the
-    gyro with `drift` (3,) taken off; J (m, 3, 3), through which a further drift acts; extra variance (m, 3)."""
-
-    epochs: np.ndarray
-    time: np.ndarray
-    turn: np.ndarray
-    J: np.ndarray
-    extra: np.ndarray
-    drift: np.ndarray
-
-    @property
-    def duration(self) -> np.ndarray:
-        """Length (m,) in s."""
-        return np.diff(self.time)
-
-
-def integrate_between(timeline: Timeline, epochs: Epochs, take: np.ndarray, drift: np.ndarray) -> Between:
-    """The gyro less `drift` (3,) integrated between the epochs that the mask `take` (m,) names, all of them solved."""
-    number = timeline.epoch
-    known = (number >= 0) & take[np.maximum(number, 0)]
-    places = np.flatnonzero(known)
-    n = len(timeline.rate)
-    dt = np.diff(timeline.time)
-    rate = timeline.rate - drift
-    qs, Js = [np.empty((0, 4))], [np.empty((0, 3, 3))]
-    q0, J0 = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros((3, 3))
-    for a in range(0, n, STEPS):
-        b = min(a + STEPS, n)
-        pad = STEPS - (b - a)
-        q, J = integrate_gyro(
-            jnp.asarray(np.pad(rate[a:b], ((0, pad), (0, 0)))),
-            jnp.asarray(np.pad(dt[a:b], (0, pad))),
-            jnp.asarray(np.pad(known[a:b], (0, pad))),
-            jnp.asarray(q0),
-            jnp.asarray(J0),
-        )
-        q, J = np.asarray(q), np.asarray(J)
-        qs.append(q[: b - a])
-        Js.append(J[: b - a])
-        q0, J0 = q[-1], J[-1]
-    ends = places[1:] - 1
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(timeline.extra, axis=0)])
-    return Between(
-        number[places],
-        timeline.time[places],
-        np.concatenate(qs)[ends],
-        np.concatenate(Js)[ends],
-        total[places[1:]] - total[places[:-1]],
-        drift,
-    )
-
-
-def drifts(between: Between, epochs: Epochs) -> np.ndarray:
-    """Drift (m, 3) in rad/s that each pair of neighbours implies."""
-    q = jnp.asarray(epochs.q_BN[between.epochs])
-    predicted = quaternion.multiply(jnp.asarray(between.turn), q[:-1])
-    e = np.asarray(quaternion.log(quaternion.multiply(q[1:], quaternion.conjugate(predicted))))
-    return between.drift + np.linalg.solve(between.J, e[..., None])[..., 0]
-
-
-def intervals(between: Between, epochs: Epochs, drift: np.ndarray, good: np.ndarray) -> Intervals:
-    """What the noise estimate needs: turns with a drift (3,) taken off; `good` (number of epochs,) says which to use."""
-    corrected = np.einsum("mij,j->mi", between.J, drift - between.drift)
-    q = quaternion.multiply(quaternion.exp(jnp.asarray(corrected)), jnp.asarray(between.turn))
-    turn = -np.asarray(quaternion.log(q))
-    e = between.epochs
-    return Intervals(epochs.q_BN[e], epochs.shape[e], turn, between.duration, between.extra, good[e])
 
 
 @dataclass(frozen=True)
@@ -112,30 +35,28 @@ class Beginning:
     sigma: np.ndarray
 
 
-def find_beginning(between: Between, epochs: Epochs, levels: NoiseLevels, limit: float) -> Beginning:
+def find_beginning(series: Series, levels: NoiseLevels, limit: float) -> Beginning:
     """The first attitude that agrees with those that follow; `limit` is the largest chi-square of three degrees of freedom."""
-    count = len(between.epochs)
-    found: list[tuple[float, _Window, np.ndarray]] = []
-    for begin in list(range(0, max(count - 1, 1), WINDOW // 2))[:WINDOWS]:
-        window = _Window.of(between, epochs, levels, begin, min(begin + WINDOW, count))
+    found: list[tuple[float, int, _Window, np.ndarray]] = []
+    for begin in list(range(0, max(len(series) - 1, 1), WINDOW // 2))[:WINDOWS]:
+        window = _Window.of(series.select(np.arange(begin, min(begin + WINDOW, len(series)))), levels)
         agreeing = window.agreeing(limit)
-        found.append((float(agreeing.mean()), window, agreeing))
+        found.append((float(agreeing.mean()), begin, window, agreeing))
         if found[-1][0] >= AGREE:
             break
-    _, window, agreeing = max(found, key=lambda entry: entry[0])
+    _, begin, window, agreeing = max(found, key=lambda entry: entry[0])
     right = np.flatnonzero(agreeing)
     drift, sigma = window.drift(int(right[0]), int(right[1]))
     # What lies before the window was found to agree with nothing.
-    places = np.concatenate([np.arange(window.begin), window.begin + np.flatnonzero(~agreeing)])
-    return Beginning(int(between.epochs[window.begin + right[0]]), between.epochs[places], between.drift + drift, sigma)
+    wrong = np.concatenate([np.arange(begin), begin + np.flatnonzero(~agreeing)])
+    return Beginning(int(series.epochs[begin + right[0]]), series.epochs[wrong], series.drift + drift, sigma)
 
 
 @dataclass(frozen=True)
 class _Window:
-    """n attitudes brought back to the first one's instant: y (n, n, 3), y[i, k] = log(D_k D_i^-1); A (n, 3, 3); covariance S (n, 3, 3)
-    of each; variance c (n, 3) of the gyro's walk since the first; time t (n,)."""
+    """n attitudes brought back: y (n, n, 3), y[i, k] = log(D_k D_i^-1); A (n, 3, 3); covariance S (n, 3, 3) of each; variance
+    c (n, 3) of the gyro's walk since the first; time t (n,)."""
 
-    begin: int
     y: np.ndarray
     A: np.ndarray
     S: np.ndarray
@@ -144,22 +65,11 @@ class _Window:
     sigma_u: float
 
     @classmethod
-    def of(cls, between: Between, epochs: Epochs, levels: NoiseLevels, begin: int, end: int) -> _Window:
-        n = end - begin
-        e = between.epochs[begin:end]
-        P, J = [Rotation.identity()], [np.zeros((3, 3))]
-        for k in range(begin, end - 1):
-            turn = Rotation.from_quat(between.turn[k])
-            P.append(turn * P[-1])
-            J.append(turn.as_matrix() @ J[-1] + between.J[k])
-        back = np.stack([p.inv().as_matrix() for p in P])
-        D = [p.inv() * Rotation.from_quat(q) for p, q in zip(P, epochs.q_BN[e], strict=True)]
-        y = np.array([[(D[k] * D[i].inv()).as_rotvec() for k in range(n)] for i in range(n)])
-        walk = levels.sigma_v**2 * between.duration[begin : end - 1, None] + between.extra[begin : end - 1]
-        S = back @ (epochs.shape[e] * levels.sigma**2) @ np.swapaxes(back, 1, 2)
-        c = np.concatenate([np.zeros((1, 3)), np.cumsum(walk, axis=0)])
-        t = between.time[begin:end] - between.time[begin]
-        return cls(begin, y, back @ np.stack(J), S, c, t, levels.sigma_u)
+    def of(cls, series: Series, levels: NoiseLevels) -> _Window:
+        y = np.stack([series.since(i) for i in range(len(series))])
+        t = series.time - series.time[0]
+        c = levels.sigma_v**2 * t[:, None] + series.extra - series.extra[0]
+        return cls(y, series.A, series.shape * levels.sigma**2, c, t, levels.sigma_u)
 
     def drift(self, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
         """Drift (3,) from attitude i to j, and its sigma (3,)."""
@@ -184,6 +94,34 @@ class _Window:
                 merit = (cost, 0.0) if right.sum() > 2 else (1e300, float(np.linalg.norm(b)))
                 if merit < best:
                     best, agreeing = merit, right
+        return self._without_strangers(agreeing, limit)
+
+    def _without_strangers(self, agreeing: np.ndarray, limit: float) -> np.ndarray:
+        """Those (n,) of the agreeing that all the others together agree with, by least squares over them."""
+        agreeing = agreeing.copy()
+        while agreeing.sum() > 3:
+            k = np.flatnonzero(agreeing)
+            n, t = len(k), self.t[k]
+            low, high = np.minimum.outer(t, t), np.maximum.outer(t, t)
+            walk = (
+                np.minimum(self.c[k][:, None], self.c[k][None])
+                + (self.sigma_u**2 * low**2 * (3.0 * high - low) / 6.0)[:, :, None]
+            )
+            V = np.einsum("kla,ab->kalb", walk, np.eye(3))
+            V[np.arange(n), :, np.arange(n), :] += self.S[k]
+            W = np.linalg.inv(V.reshape(3 * n, 3 * n))
+            H = np.concatenate([np.broadcast_to(np.eye(3), (n, 3, 3)), self.A[k] - self.A[k[0]]], axis=2).reshape(
+                3 * n, 6
+            )
+            WH = W @ H
+            M = W - WH @ np.linalg.solve(H.T @ WH, WH.T)
+            r = (M @ self.y[k[0], k].reshape(-1)).reshape(n, 3)
+            own = M.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
+            distance = np.einsum("ka,ka->k", r, np.linalg.solve(own, r[..., None])[..., 0])
+            worst = int(np.argmax(distance))
+            if not distance[worst] > limit:
+                break
+            agreeing[k[worst]] = False
         return agreeing
 
     def _distances(self, i: int, j: int, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
