@@ -12,7 +12,21 @@ import argparse
 import json
 import time
 
-from problem import DT, P0, R_N, SIGMA, SIGMA_U, SIGMA_V, Problem, angle, cpu_seconds, one_core, positive, simulate, table
+from problem import (
+    DT,
+    P0,
+    R_N,
+    SIGMA,
+    SIGMA_U,
+    SIGMA_V,
+    Problem,
+    angle,
+    cpu_seconds,
+    one_core,
+    positive,
+    simulate,
+    table,
+)
 
 BATCHES = (25, 50, 100, 250, 500, 1000)
 

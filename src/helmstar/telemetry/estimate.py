@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from ..backend import jax, jnp
-from ..core import Gate, Gaussian, Measurement, Model, Predicted
-from ..filters import ErrorStateKalmanFilter, run, smooth, smooth_step
+from ..core import Gate, Gaussian, Measurement, Model
+from ..filters import ErrorStateKalmanFilter, run, smooth
 from ..geometry import so3_left
 from ..geometry.retraction import euclidean, product
 from ..models.attitude import AttitudeDrift, GyroInput, GyroNoise, attitude_drift_model, whole_attitude
@@ -76,11 +76,12 @@ def _forward(
 
 
 @jax.jit
-def _backward(track: Any, following: Predicted, later: Gaussian) -> Gaussian:
-    """Smoothed beliefs of a chunk; `following` is the prediction that leads out of it, `later` the smoothed belief there."""
-    last = Gaussian(jax.tree.map(lambda a: a[-1], track.belief.mean), track.belief.cov[-1])
-    end = smooth_step(RETRACTION, last, following, later)
-    return smooth(RETRACTION, track.belief, track.predicted, end)
+def _backward(begin: Gaussian, track: Any, later: Gaussian) -> Gaussian:
+    """Smoothed beliefs at the begin of a chunk and after each of its steps; `later` is the one at its end."""
+    front = lambda a, b: jnp.concatenate([a[None], b])  # noqa: E731
+    filtered = Gaussian(jax.tree.map(front, begin.mean, track.belief.mean), front(begin.cov, track.belief.cov))
+    predicted = jax.tree.map(lambda a: front(a[0], a), track.predicted)  # the first one is not looked at
+    return smooth(RETRACTION, filtered, predicted, later)
 
 
 class Record:
@@ -150,20 +151,17 @@ def filter_and_smooth(
 def _smooth(
     record: Record, model: Model, begins: list, end: Gaussian, gate: Gate, advance: Callable[[], None]
 ) -> Estimates:
-    # At the very end a step of no length leads to the filtered belief itself.
-    later, following = end, Predicted(end.mean, end.cov, jnp.eye(6))
-    parts = []
+    later, parts = end, []
     for i in reversed(range(record.chunks)):
         belief, refused = begins[i]
         u, dt, m = record.chunk(i)
         _, _, track = _forward(model, belief, refused, u, dt, m, gate)
-        smoothed = _backward(track, following, later)
-        parts.append(_numbers(smoothed, record.length(i)))
-        following = jax.tree.map(lambda a: a[0], track.predicted)
+        smoothed = _backward(belief, track, later)
+        q, b, P = _numbers(smoothed, record.length(i) + 1)
+        parts.append((q[1:], b[1:], P[1:]))
         later = Gaussian(jax.tree.map(lambda a: a[0], smoothed.mean), smoothed.cov[0])
         advance()
-    first, _ = begins[0]
-    parts.append(_first(smooth_step(RETRACTION, first, following, later)))
+    parts.append(_first(later))
     return _joined(parts[::-1])
 
 

@@ -334,5 +334,5 @@ def _uncertainty(hessian: np.ndarray) -> np.ndarray:
     told = np.flatnonzero(np.diagonal(hessian) < -FLAT)
     if len(told):
         variance = np.diagonal(np.linalg.pinv(-hessian[np.ix_(told, told)]))
-        out[told] = np.sqrt(np.where(variance > 0.0, variance, np.nan))
+        out[told] = np.sqrt(np.where((variance > 0.0) & (variance < 1.0), variance, np.nan))
     return out
