@@ -336,6 +336,85 @@ def test_a_model_without_sensors_predicts():
     assert worst_covariance(last.cov, P) < LINEAR
 
 
+# --- the unscented transform on a curved problem -----------------------------------------------------------------------
+
+
+def _curved_step(p: Drive, x, u, dt, w):
+    return jnp.stack([x[0] + dt * x[1] + 0.1 * dt * x[0] * x[1] + w[0] * (1 + 0.3 * x[1]), x[1] - 0.2 * dt * x[0] ** 2 + w[1]])
+
+
+def _curved_predict(p: Line, x, a):
+    return jnp.stack([x[0] * x[1] + a[0], x[0] ** 2 + x[1] + a[1]])
+
+
+CURVED_MODEL = Model(
+    euclidean(2),
+    Process(_curved_step, Noise(_noise, 2), LINEAR_MODEL.process.params),
+    (Sensor(_curved_predict, _minus, _cov, LINES[0]),),
+)
+
+
+@compiled
+def _run_curved(spreads, dt, m):
+    def one(spread):
+        belief = UnscentedBelief(jnp.asarray(X0), jnp.asarray(P0), spread)
+        return run(UnscentedKalmanFilter(euclidean(2)), CURVED_MODEL, belief, jnp.zeros((T, 2)), dt, (m,), no_gate())[2]
+
+    return jax.vmap(one)(spreads)
+
+
+def textbook_ukf(spread, d: LinearData, c: int) -> tuple[np.ndarray, np.ndarray]:
+    """Wan and van der Merwe (2000), state augmented with the noise, every point with its two weights."""
+    alpha, beta, kappa = (float(v) for v in (spread.alpha, spread.beta, spread.kappa))
+
+    def points(x, P):
+        n = len(x)
+        lam = alpha**2 * (n + kappa) - n
+        root = np.linalg.cholesky((n + lam) * P)
+        wm = np.full(2 * n + 1, 0.5 / (n + lam))
+        wm[0] = lam / (n + lam)
+        wc = wm.copy()
+        wc[0] += 1 - alpha**2 + beta
+        return np.concatenate([x[None], x + root.T, x - root.T]), wm, wc
+
+    x, P, out = X0, P0, []
+    for k in range(T):
+        t = d.dt[c, k]
+        X, wm, wc = points(np.append(x, [0.0, 0.0]), np.block([[P, np.zeros((2, 2))], [np.zeros((2, 2)), np.diag(Q_W * t)]]))
+        Y = np.stack(
+            [X[:, 0] + t * X[:, 1] + 0.1 * t * X[:, 0] * X[:, 1] + X[:, 2] * (1 + 0.3 * X[:, 1]),
+             X[:, 1] - 0.2 * t * X[:, 0] ** 2 + X[:, 3]], axis=1,
+        )  # fmt: skip
+        x = wm @ Y
+        P = (wc[:, None] * (Y - x)).T @ (Y - x)
+        X, wm, wc = points(x, P)
+        a = d.a[0][c, k]
+        Z = np.stack([X[:, 0] * X[:, 1] + a[0], X[:, 0] ** 2 + X[:, 1] + a[1]], axis=1)
+        z = wm @ Z
+        S = (wc[:, None] * (Z - z)).T @ (Z - z) + R1
+        K = (wc[:, None] * (X - x)).T @ (Z - z) @ np.linalg.inv(S)
+        x, P = x + K @ (d.z[0][c, k] - z), P - K @ S @ K.T
+        out.append((x, P))
+    x, P = zip(*out, strict=True)
+    return np.array(x), np.array(P)
+
+
+def test_unscented_transform_is_the_textbook_s_on_a_curved_problem():
+    """The weights of the centre, which a linear problem does not see; short steps, so that the state stays in order 1."""
+    d = linear_data()
+    d = d._replace(dt=0.1 * d.dt)
+    m = Measurement(*(jnp.asarray(v[0][0]) for v in (d.z, d.a, d.mask)))
+    spreads = SPREADS[1:-1]  # with kappa = -1 the centre's weight is negative, and P may be
+    t = numpy_of(_run_curved(jax.tree.map(lambda *a: jnp.stack(a), *spreads), jnp.asarray(d.dt[0]), m))
+    means = []
+    for i, spread in enumerate(spreads):
+        x, P = textbook_ukf(spread, d, 0)
+        assert worst(t.belief.mean[i], x) < SPREAD_TOLERANCES[1]
+        assert worst_covariance(t.belief.cov[i], P) < SPREAD_TOLERANCES[1]
+        means.append(x)
+    assert min(worst(a, b) for a, b in zip(means, means[1:], strict=False)) > 1e-3  # the spreads differ here
+
+
 # --- the smoother --------------------------------------------------------------------------------------------------
 
 
