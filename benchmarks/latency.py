@@ -1,6 +1,6 @@
 """Latency of one streaming step of the 6-state MEKF: median and 99th percentile in microseconds, on one core.
 
-    python benchmarks/latency.py [--steps 3000] [--json]
+python benchmarks/latency.py [--steps 3000] [--json]
 """
 
 from __future__ import annotations

@@ -150,7 +150,9 @@ def main() -> None:
         out["helmstar"][str(width)] = {
             "us": us, "ratio": us / c_us, "trace_s": traced, "compile_s": compiled, "rad_from_c": off, "nis_from_c": off_nis,
         }  # fmt: skip
-        rows.append([f"helmstar, batches of {width}", f"{us:.2f}", f"{us / c_us:.2f}", f"{traced:.1f} + {compiled:.1f} s"])
+        rows.append(
+            [f"helmstar, batches of {width}", f"{us:.2f}", f"{us / c_us:.2f}", f"{traced:.1f} + {compiled:.1f} s"]
+        )
     best = min(v["us"] for v in out["helmstar"].values())
     few = min(1000, args.steps)
     for name, seconds in (

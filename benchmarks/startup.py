@@ -1,6 +1,6 @@
 """Start-up and first-run times: wall seconds of whole commands, cold and warm compilation cache.
 
-    python benchmarks/startup.py [--json]
+python benchmarks/startup.py [--json]
 """
 
 from __future__ import annotations

@@ -151,7 +151,8 @@ def test_recursive_bound_is_the_information_form():
     np.testing.assert_array_equal(recursive_bound(F, Q, J[0], P0), recursive_bound(F, Q, np.zeros_like(J), P0))
     # One matrix for all steps.
     np.testing.assert_array_equal(
-        recursive_bound(F, Q[1], J[1], P0), recursive_bound(F, np.tile(Q[1], (steps, 1, 1)), np.tile(J[1], (steps, 1, 1)), P0)
+        recursive_bound(F, Q[1], J[1], P0),
+        recursive_bound(F, np.tile(Q[1], (steps, 1, 1)), np.tile(J[1], (steps, 1, 1)), P0),
     )
     assert recursive_bound(F[0], Q[0], J[0], P0).shape == (1, n, n)
 
@@ -161,7 +162,9 @@ def test_recursive_bound_bears_what_the_information_form_does_not():
     n = 3
     J = np.zeros((n, n))
     J[0, 0] = 4.0
-    np.testing.assert_array_equal(recursive_bound(np.eye(n), np.zeros((n, n)), np.tile(J, (5, 1, 1)), np.zeros((n, n))), 0.0)
+    np.testing.assert_array_equal(
+        recursive_bound(np.eye(n), np.zeros((n, n)), np.tile(J, (5, 1, 1)), np.zeros((n, n))), 0.0
+    )
     bound = recursive_bound(np.eye(n), np.zeros((n, n)), np.tile(J, (5, 1, 1)), np.eye(n))
     for k in range(5):
         np.testing.assert_allclose(bound[k], np.diag([1 / (1 + 4.0 * (k + 1)), 1.0, 1.0]), rtol=1e-13)
@@ -189,7 +192,9 @@ def test_recursive_bound_converges_to_the_closed_steady_state(q, turning):
     c, s = np.cos(turning), np.sin(turning)
     F = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     p = steady_state_variance(q, sigma2, m)
-    steps = int(40 * np.sqrt(sigma2 / q)) + 60  # the recursion forgets by 1 - sqrt(q / r) per step, and the rest doubles
+    steps = (
+        int(40 * np.sqrt(sigma2 / q)) + 60
+    )  # the recursion forgets by 1 - sqrt(q / r) per step, and the rest doubles
     bound = recursive_bound(np.tile(F, (steps, 1, 1)), q * np.eye(3), np.diag(m) / sigma2, np.eye(3))[-1]
     np.testing.assert_allclose(bound, np.diag(p), rtol=1e-10, atol=1e-10 * p.max())
 

@@ -145,7 +145,9 @@ def test_torque_is_the_change_of_angular_momentum():
 def test_the_start_may_be_any_time_and_any_length_of_quaternion():
     s = rigid_body.simulate(np.array([5.0, 6.0]), 3.0 * Q0, "body", rate=lambda t: rate(t - 5.0))
     np.testing.assert_allclose(s.q[0], Q0, atol=1e-15)
-    np.testing.assert_allclose(s.q[1], rigid_body.simulate(np.array([0.0, 1.0]), Q0, "body", rate=rate).q[1], atol=1e-12)
+    np.testing.assert_allclose(
+        s.q[1], rigid_body.simulate(np.array([0.0, 1.0]), Q0, "body", rate=rate).q[1], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("time", [[], [5.0], [0.0, 1.0, 1.0], [1.0, 0.0], [0.0, np.nan]])

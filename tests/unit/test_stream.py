@@ -22,9 +22,7 @@ def problem():
     model = attitude_drift_model(
         GyroNoise(jnp.asarray(1e-5), jnp.asarray(1e-7)), sensors=(star_directions(1e-4), whole_attitude())
     )
-    belief = Gaussian(
-        AttitudeDrift(np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)), np.diag([1e-4] * 3 + [1e-8] * 3)
-    )
+    belief = Gaussian(AttitudeDrift(np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)), np.diag([1e-4] * 3 + [1e-8] * 3))
     r_N = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     stars = Measurement(
         r_N + 1e-4 * rng.normal(size=(STEPS, 2, 3)), np.broadcast_to(r_N, (STEPS, 2, 3)), rng.random((STEPS, 2)) < 0.7

@@ -82,7 +82,7 @@ def test_every_reading_gives_the_drift_back(capsys, tmp_path, reading):
 
 
 def test_attitudes_are_as_good_as_they_say(capsys, tmp_path):
-    times, R, h = simulate(tmp_path, 2)
+    _, R, h = simulate(tmp_path, 2)
     attitude(capsys, tmp_path, GIVEN)
     nees = {}
     for name in ("filtered", "smoothed"):
@@ -159,7 +159,9 @@ def test_gaps_are_listed_and_bridged(capsys, tmp_path):
 def test_bad_rows_are_named_and_strict_refuses_them(capsys, tmp_path):
     simulate(tmp_path, 8)
     stars = (tmp_path / "stars.csv").read_text().splitlines()
-    q = (Rotation.from_rotvec([0, 0.01, 0]) * Rotation.from_quat([float(v) for v in stars[31].split(",")[1:]])).as_quat()
+    q = (
+        Rotation.from_rotvec([0, 0.01, 0]) * Rotation.from_quat([float(v) for v in stars[31].split(",")[1:]])
+    ).as_quat()
     stars[31] = ",".join([stars[31].split(",")[0], *(f"{v:.12g}" for v in q)])  # a jump, line 32
     stars[50] = ",".join([stars[50].split(",")[0], "nan", "0", "0", "1"])  # line 51
     stars[60] = ",".join([stars[60].split(",")[0], "0.5", "0.5", "0.5", "0.9"])  # not unit, line 61

@@ -185,7 +185,8 @@ def _compute_on_dask(
         def submit(piece: list[int]) -> Future:
             return pool.submit(compute_block, experiment.name, spec, tuple(names), piece[0])
 
-        ahead = 2 * max(1, sum(client.nthreads().values()))
+        threads: Any = client.nthreads()
+        ahead = 2 * max(1, sum(threads.values()))
         interrupted, failure = _drain([[i] for i in todo], submit, ahead, keep, lambda: None)
     return _settled(store, experiment.width, failure, interrupted, bar, task)
 

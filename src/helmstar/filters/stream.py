@@ -48,7 +48,9 @@ class _Packing:
         for leaf, shape, i, j in zip(leaves, self.shapes, self.bounds[:-1], self.bounds[1:], strict=True):
             a = np.asarray(leaf)
             if a.shape != shape:
-                raise ValueError(f"{self.what}: an array of shape {a.shape} given where the stream was built for {shape}")
+                raise ValueError(
+                    f"{self.what}: an array of shape {a.shape} given where the stream was built for {shape}"
+                )
             out[i:j] = a.reshape(-1)
         return out
 

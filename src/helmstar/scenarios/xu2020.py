@@ -186,20 +186,16 @@ class Experiment:
         self.gyro_sigma = spec.gyro.sigma_rad_step
         self.truth = truth_of(spec)
         error = spec.start.error_deg
-        self.simulate = Call(
-            simulate,
-            (
-                Setting(
-                    q=np.asarray(self.truth.q),
-                    increment=np.asarray(self.truth.increment),
-                    r_N=np.asarray(spec.star.directions, dtype=float),
-                    star_sigma=np.asarray(self.star_sigma),
-                    gyro_sigma=np.asarray(self.gyro_sigma),
-                    start_error=np.asarray(-1.0 if error is None else np.deg2rad(error)),
-                    seed=np.asarray(spec.seed),
-                ),
-            ),
-        )
+        data: dict[str, Any] = {
+            "q": self.truth.q,
+            "increment": self.truth.increment,
+            "r_N": np.asarray(spec.star.directions, dtype=float),
+            "star_sigma": np.asarray(self.star_sigma),
+            "gyro_sigma": np.asarray(self.gyro_sigma),
+            "start_error": np.asarray(-1.0 if error is None else np.deg2rad(error)),
+            "seed": np.asarray(spec.seed),
+        }
+        self.simulate = Call(simulate, (Setting(**data),))
         self.estimators = self._estimators()
 
     def _estimators(self) -> dict[str, Call]:
@@ -209,8 +205,9 @@ class Experiment:
         q = self.gyro_sigma**2
         spread = scaled(t.ukf_alpha, t.ukf_beta, t.ukf_kappa)
 
-        def call(filter: Any, model: Model, stars: Array, P0: Array, spread: Spread | None = None, fix: bool = False):
-            prior = Prior(P0, np.asarray(fix), spread)
+        def call(filter: Any, model: Model, stars: Any, P0: Any, spread: Spread | None = None, fix: bool = False):
+            from_fix: Any = np.asarray(fix)
+            prior = Prior(P0, from_fix, spread)
             return Call(estimate, (model, prior, stars), {"filter": filter})
 
         right, left = ErrorStateKalmanFilter(so3_right), ErrorStateKalmanFilter(so3_left)

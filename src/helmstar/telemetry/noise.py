@@ -35,8 +35,8 @@ NAMES = ("sigma_v", "sigma_u", "sigma")
 FLAT = 1.0
 """Curvature of a log likelihood by the logarithm of a level, below which the data do not tell the level."""
 SIGNS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
-SMALLEST = 1e-10
-"""Scatter in rad below which data are as exact as their digits."""
+SMALLEST = 1e-9
+"""Scatter in rad (0.0002 arcsec) below which data are as exact as their digits."""
 
 
 @dataclass(frozen=True)
@@ -128,23 +128,22 @@ def rough_levels(series: Series, known: dict[str, float]) -> NoiseLevels:
             "two attitudes alone do not tell how noisy they are; state the noise in sensors.toml: [gyro] "
             "arw_arcsec_sqrt_s and [star] sigma_arcsec"
         )
-    scatter, T = _scatter(series), float(np.median(np.diff(series.time)))
-    guess = {"sigma_v": scatter / np.sqrt(T), "sigma_u": 0.0, "sigma": scatter / np.sqrt(_mean_shape(series))}
+    (gyro, star), T = _scatter(series), float(np.median(np.diff(series.time)))
+    guess = {"sigma_v": gyro / np.sqrt(T), "sigma_u": 0.0, "sigma": star}
     levels = guess | known
     return NoiseLevels(levels["sigma_v"], levels["sigma_u"], levels["sigma"], dict.fromkeys(unknown, np.nan))
 
 
-def _mean_shape(series: Series) -> float:
-    return float(np.mean(np.trace(series.shape, axis1=1, axis2=2)) / 3.0)
-
-
-def _scatter(series: Series) -> float:
-    """Robust standard deviation (rad) of gyro against stars from epoch to epoch, about the common drift."""
+def _scatter(series: Series) -> tuple[float, float]:
+    """Robust standard deviation from epoch to epoch about the common drift: in rad, and in units of the stars' shapes."""
     e, T = series.steps(), np.diff(series.time)[:, None]
     e = e - np.median(e / T, axis=0) * T
+    white = np.linalg.solve(np.linalg.cholesky(series.shape[1:] + series.shape[:-1]), e[..., None])[..., 0]
     if len(e) >= ENOUGH:
-        return max(1.4826 * float(np.median(np.abs(e))), SMALLEST)
-    return max(float(np.sqrt(np.sum(e**2) / (3.0 * max(len(e) - 1, 1)))), SMALLEST)
+        gyro, star = (1.4826 * float(np.median(np.abs(x))) for x in (e, white))
+    else:
+        gyro, star = (float(np.sqrt(np.sum(x**2) / (3.0 * max(len(e) - 1, 1)))) for x in (e, white))
+    return max(gyro, SMALLEST), max(star * np.sqrt(2.0), SMALLEST)
 
 
 def estimate_noise(
@@ -163,12 +162,12 @@ def estimate_noise(
         return rough
     parts = [series.select(index) for index in selections(len(series))]
     likelihood = _Likelihood([_padded(part) for part in parts], known, names, misfit, gate)
-    scatter, mean_shape = _scatter(series), _mean_shape(series)
+    gyro, star = _scatter(series)
     T, total = float(np.median(np.diff(series.time))), float(series.time[-1] - series.time[0])
     box = {
-        "sigma_v": scatter / np.sqrt(T) * np.array([1e-4, 3.0]),
-        "sigma_u": scatter * np.array([0.03 / total**1.5, 3.0 / T**1.5]),
-        "sigma": scatter / np.sqrt(mean_shape) * np.array([1e-4, 3.0]),
+        "sigma_v": gyro / np.sqrt(T) * np.array([1e-4, 3.0]),
+        "sigma_u": gyro * np.array([0.03 / total**1.5, 3.0 / T**1.5]),
+        "sigma": star * np.array([1e-4, 3.0]),
     }
     bounds = np.log(np.array([box[n] for n in names]))
     if len(names) == 3:  # the scale follows from the innovations, so that two ratios are left to search
@@ -221,10 +220,12 @@ class _Likelihood:
         runs = list(self._runs(np.exp(np.column_stack([ratios, np.zeros(len(ratios))]))))
         nis, log_det, used = (np.concatenate(x, axis=1) for x in zip(*runs, strict=True))
         count = np.maximum(used.sum(axis=1, keepdims=True), 1)
-        variance = np.nanmedian(np.where(used, nis, np.nan), axis=1, keepdims=True) / 2.366
+        smallest = SMALLEST**2
+        variance = np.maximum(np.nanmedian(np.where(used, nis, np.nan), axis=1, keepdims=True) / 2.366, smallest)
         for _ in range(12):
             weight = (STUDENT + 3.0) / (STUDENT + nis / variance)
             variance = np.sum(np.where(used, weight * nis, 0.0), axis=1, keepdims=True) / (3.0 * count)
+            variance = np.maximum(variance, smallest)
         value = np.sum(np.where(used, _student(nis, log_det, variance), 0.0), axis=1)
         return variance[:, 0], np.where(np.isfinite(value), value, -np.inf)
 
