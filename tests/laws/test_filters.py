@@ -1290,7 +1290,7 @@ def iterated_data():
 
 @compiled
 def _iterate(q, P, z, stars, mask):
-    filter = ErrorStateKalmanFilter(so3_left, "jacobian", iterations=6)
+    filter = ErrorStateKalmanFilter(so3_left, "jacobian", iterations=12)
 
     def one(q, P, z, stars, mask):
         m = Measurement(z, stars, mask)
