@@ -66,7 +66,7 @@ def _consistency(solution: Solution) -> dict[str, Any]:
 
     u = solution.updates
     used = u.status == ACCEPTED
-    if solution.start.from_pair:
+    if solution.start_source != "sensors.toml" and len(used):
         used = used & (np.arange(len(used)) > 0)  # the first one's residual went into the start
     nis, dof = u.nis[used], u.dof[used]
     if not len(nis):

@@ -32,14 +32,12 @@ FILTER = ErrorStateKalmanFilter(RETRACTION)
 
 @dataclass(frozen=True)
 class Start:
-    """Belief at the timeline's first instant: q_BN (4,), attitude covariance (3, 3), drift (3,) rad/s, its sigma (3,), and
-    whether the drift comes from the second attitude, whose residual then is no test of anything."""
+    """Belief at the timeline's first instant: q_BN (4,), attitude covariance (3, 3), drift (3,) rad/s, its sigma (3,)."""
 
     q_BN: np.ndarray
     attitude_cov: np.ndarray
     drift: np.ndarray
     drift_sigma: np.ndarray
-    from_pair: bool
 
 
 @dataclass(frozen=True)

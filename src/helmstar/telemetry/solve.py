@@ -218,12 +218,12 @@ def _start(
     cov = epochs.shape[0] * levels.sigma**2
     given = sensors.gyro.initial_drift_sigma
     if given is None:
-        start = Start(epochs.q_BN[0], cov, beginning.drift, DIFFUSE * beginning.sigma, True)
-        return start, "first two attitudes minus the gyro"
+        return Start(
+            epochs.q_BN[0], cov, beginning.drift, DIFFUSE * beginning.sigma
+        ), "first two attitudes minus the gyro"
     # A drift far less known than two attitudes tell it is best linearised about what they tell.
     vague = given > DIFFUSE * float(np.max(beginning.sigma))
-    drift = beginning.drift if vague else np.zeros(3)
-    return Start(epochs.q_BN[0], cov, drift, np.full(3, given), vague), "sensors.toml"
+    return Start(epochs.q_BN[0], cov, beginning.drift if vague else np.zeros(3), np.full(3, given)), "sensors.toml"
 
 
 def _refused(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate) -> list[Problem]:
