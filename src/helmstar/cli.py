@@ -275,7 +275,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return args.call(args)
     except HelmstarError as error:
-        _say(f"error: {error}")
+        # Several errors are several lines; indented ones are details of what the last line states.
+        _say("\n".join(s if s.startswith(" ") else f"error: {s}" for s in str(error).splitlines() or [""]))
         return 1
     except KeyboardInterrupt:
         _say("interrupted: nothing was finished")

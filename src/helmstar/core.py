@@ -104,9 +104,10 @@ class Predicted:
     F: Array
 
 
-ABSENT, ACCEPTED, GATED, REOPENED, RESET = range(5)
+ABSENT, ACCEPTED, GATED, REOPENED, FORCED, RESET = range(6)
 """Status of an update: no measurement; used; refused by the gate; refused once too often, so that the covariance was
-grown to open the gate again (see `Gate`); belief started anew."""
+grown to open the gate again, without use of the measurement; used although the gate, opened again, still refused it (see
+`Gate`); belief started anew."""
 
 
 @pytree
@@ -128,7 +129,7 @@ class Gate:
 
     The `reopen_after`-th refusal of a sensor in a row makes the belief's covariance grow until it explains the
     residual (status REOPENED), so that the gate opens for the measurements that follow. Of those, the ones still
-    refused are used all the same (REOPENED again), with their covariance grown likewise: a nonlinear sensor has
+    refused are used all the same (FORCED), with their own covariance grown likewise: a nonlinear sensor has
     residuals that no covariance of the state explains, and would never come back from an upset.
     """
 
@@ -167,9 +168,9 @@ def chi_square_gate(probability: float, max_dof: int = 64, reopen_after: int = 5
 
     Raises ValueError for a probability outside (0, 1).
     """
-    from scipy.stats import chi2
+    from scipy.special import gammainccinv  # scipy.stats takes longer to load than an hour of data to filter
 
     if not 0.0 < probability < 1.0:
         raise ValueError(f"gate probability {probability!r}: must lie between 0 and 1, such as 1e-6")
-    limits = chi2.isf(probability, df=range(1, max_dof + 1))
+    limits = 2.0 * gammainccinv([0.5 * m for m in range(1, max_dof + 1)], probability)
     return Gate(limits=jnp.concatenate([jnp.zeros(1), jnp.asarray(limits)]), reopen_after=jnp.asarray(reopen_after))

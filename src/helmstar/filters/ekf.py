@@ -27,6 +27,7 @@ from ..backend import jax, jnp
 from ..core import (
     ABSENT,
     ACCEPTED,
+    FORCED,
     GATED,
     REOPENED,
     Gate,
@@ -88,19 +89,19 @@ def judge(e: Array, S: Array, rows: Array, gate: Gate, refused: Array) -> tuple[
     white = small.matvec(V, e)
     nis = jnp.sum(white * white)
     dof = jnp.sum(rows)
-    status = jnp.where((refused + 1 >= gate.reopen_after) & jnp.isfinite(nis), REOPENED, GATED)
+    often = jnp.where(refused >= gate.reopen_after, FORCED, REOPENED)
+    status = jnp.where((refused + 1 >= gate.reopen_after) & jnp.isfinite(nis), often, GATED)
     status = jnp.where(nis <= gate.limits[dof], ACCEPTED, status)
     status = jnp.where(dof > 0, status, ABSENT)
-    used = (status == ACCEPTED) | ((status == REOPENED) & (refused >= gate.reopen_after))
-    return V, nis, dof, status, used
+    return V, nis, dof, status, (status == ACCEPTED) | (status == FORCED)
 
 
-def grow(cov: Array, nis: Array, R: Array, S: Array, status: Array, used: Array) -> Array:
+def grow(cov: Array, nis: Array, R: Array, S: Array, status: Array) -> Array:
     """A belief whose measurements were refused again and again was too sure of itself: its covariance grows by NIS over
     the degrees of freedom that it explains, sum(1 - R_ii / S_ii), so that the gate opens for the measurements that follow."""
     explained = jnp.sum(1.0 - jnp.diagonal(R) / jnp.diagonal(S))
     factor = jnp.maximum(nis / jnp.maximum(explained, jnp.finfo(cov.dtype).eps), 1.0)
-    return jnp.where((status == REOPENED) & ~used, cov * factor, cov)
+    return jnp.where(status == REOPENED, cov * factor, cov)
 
 
 def doubt(R: Array, nis: Array, dof: Array, status: Array) -> Array:
@@ -110,7 +111,7 @@ def doubt(R: Array, nis: Array, dof: Array, status: Array) -> Array:
     do not look like any small turn): waiting for a grown covariance to open the gate would be waiting for ever. The gain is
     the one of R itself, a Gauss-Newton step towards the measurement.
     """
-    return R * jnp.where(status == REOPENED, nis / jnp.maximum(dof, 1), jnp.ones_like(nis))
+    return R * jnp.where(status == FORCED, nis / jnp.maximum(dof, 1), jnp.ones_like(nis))
 
 
 def gain(V: Array, HP: Array) -> Array:
@@ -161,7 +162,7 @@ class ErrorStateKalmanFilter:
         HP = small.matmul(H, P)
         S = small.matmul(HP, small.transpose(H)) + R
         V, nis, dof, status, used = judge(e, S, rows, gate, refused)
-        P_grown = grow(P, nis, R, S, status, used)
+        P_grown = grow(P, nis, R, S, status)
         info = information(e, S, V, rows, nis, dof, status)
         K = gain(V, HP)
         d = small.matvec(K, e)

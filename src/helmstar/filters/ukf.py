@@ -130,7 +130,7 @@ class UnscentedKalmanFilter:
         K = gain(V, Pzx)
         K = jnp.where(used, K, jnp.zeros_like(K))
         d = jnp.where(used, small.matvec(K, e), jnp.zeros(r.dim, P.dtype))
-        cov = grow(P, nis, R, S, status, used) - small.congruence(K, S + R - doubt(R, nis, dof, status))
+        cov = grow(P, nis, R, S, status) - small.congruence(K, S + R - doubt(R, nis, dof, status))
         cov = small.symmetrise(carry_covariance(r, self.carry, x, d, cov))
         return UnscentedBelief(r.boxplus(x, d), cov, belief.spread), info
 

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import PurePath
+from textwrap import indent
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -154,7 +155,8 @@ def resolve(file: str, found: Sequence[str], given: ColumnsConfiguration) -> Lay
         mapped = [name for name in (given.time, *(given.gyro or ()), *(given.quaternion or ())) if name]
         absent = [name for name in mapped if name not in found]
         hint = f"\n[columns] names what is not there: {_absent(absent, found)}." if absent else ""
-        raise DataError(f"{file}: {what} column is known.{hint}\nColumns found: {_listed(found)}\n{_REMEDY}")
+        details = indent(f"Columns found: {_listed(found)}{hint}\n{_REMEDY}", "  ")
+        raise DataError(f"{details}\n{file}: {what} column is known; what a table needs stands above")
     if bool(star_b) != bool(star_n):
         there, lacking = ("star_b", "star_n") if star_b else ("star_n", "star_b")
         raise DataError(

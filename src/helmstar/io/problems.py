@@ -65,6 +65,6 @@ def refuse(problems: Sequence[Problem], show: int = 5) -> None:
         total = sum(problem.rows for problem in problems)
         lines = [f"  {problem}" for problem in problems[:show]]
         more = [f"  ... and {len(problems) - show} more"] if len(problems) > show else []
-        head = f"{total} bad row{'s' if total > 1 else ''}, and strict reading allows none:"
-        tail = "Mend the file, or read it without --strict: bad rows are then handled as said in brackets."
-        raise DataError("\n".join([head, *lines, *more, tail]))
+        what = f"{total} bad row{'s' if total > 1 else ''}, and strict reading allows none"
+        remedy = "mend the file, or read it without --strict: bad rows are then handled as said in brackets"
+        raise DataError("\n".join([*lines, *more, f"{what}; {remedy}"]))

@@ -13,7 +13,7 @@
 | gate_limit, sensors_toml, title, headline | limit of NIS at 3 degrees of freedom; texts |
 
 `frames`: "filtered" and "smoothed" (time_s, q_bn_x .. q_bn_w, drift_x_arcsec_s .., sigma_attitude_x_arcsec ..,
-sigma_drift_x_arcsec_s ..) and "updates" (time_s, nis, nis_dof, status "accepted", "gated" or "reopened",
+sigma_drift_x_arcsec_s ..) and "updates" (time_s, nis, nis_dof, status "accepted", "gated", "reopened" or "forced",
 residual_x_arcsec .. in B, and optionally residual_sigma_x_arcsec ..). `gaps` and frames share one clock.
 """
 

@@ -196,7 +196,8 @@ def _refused(
     traces = []
     for kind, name, colour, symbol in (
         ("gated", "refused by the gate", style.RED, "x"),
-        ("reopened", "gate reopened", style.VIOLET, "diamond"),
+        ("reopened", "refused, gate reopened", style.VIOLET, "diamond"),
+        ("forced", "used against the gate", style.VIOLET, "diamond-open"),
     ):
         rows = np.flatnonzero(status == kind)[:REFUSED]
         if rows.size:

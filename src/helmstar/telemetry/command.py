@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ..core import ACCEPTED, GATED, REOPENED
+from ..core import ACCEPTED, FORCED, GATED, REOPENED
 from ..io.clock import Origin
 from ..io.screening import find_gaps
 from ..io.telemetry import Telemetry, read_telemetry
@@ -21,7 +21,7 @@ from ..versions import versions
 from .estimate import Estimates
 from .solve import ARCSEC, Solution, solve
 
-STATUS = {ACCEPTED: "accepted", GATED: "gated", REOPENED: "reopened"}
+STATUS = {ACCEPTED: "accepted", GATED: "gated", REOPENED: "reopened", FORCED: "forced"}
 
 
 def _times(t: np.ndarray, origin: Origin) -> np.ndarray:

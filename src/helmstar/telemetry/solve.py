@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..backend import jnp
-from ..core import ACCEPTED, Gate
+from ..core import ACCEPTED, FORCED, Gate, chi_square_gate, no_gate
 from ..errors import DataError
 from ..io.problems import Problem, refuse
 from ..io.screening import screen_gyro
@@ -25,7 +24,6 @@ from .timeline import Epochs, Timeline, attitude_epochs, build_timeline, reachab
 ARCSEC = np.pi / 180.0 / 3600.0
 NOT_USED = "not used"
 """Action on rows that are good but of no use here: neither rejected nor an error when reading is strict."""
-LARGEST_DOF = 8
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,7 @@ def solve(
         epochs = _within(signal, epochs, problems)
         bar.finish(task)
         task = bar.add("start and noise", 2)
-        gate = chi_square_gate(sensors.filter.gate_probability, sensors.filter.reopen_after)
+        gate = _gate(sensors)
         epochs, used, beginning, levels, sources = _begin(signal, epochs, sensors, gate, problems)
         bar.advance(task)
         start, start_source = _start(sensors, epochs, levels, beginning)
@@ -87,16 +85,10 @@ def solve(
     )  # fmt: skip
 
 
-def chi_square_gate(probability: float, reopen_after: int) -> Gate:
-    """Gate for up to LARGEST_DOF degrees of freedom that refuses a consistent measurement with `probability`; 0 refuses none.
-
-    As `core.chi_square_gate`, without loading scipy.stats, which takes longer than filtering an hour of data.
-    """
-    from scipy.special import gammainccinv
-
-    dof = np.arange(1, LARGEST_DOF + 1)
-    limits = 2.0 * gammainccinv(0.5 * dof, probability) if probability > 0.0 else np.full(len(dof), np.inf)
-    return Gate(limits=jnp.asarray(np.concatenate([[0.0], limits])), reopen_after=jnp.asarray(reopen_after))
+def _gate(sensors: SensorsConfiguration) -> Gate:
+    """The filter's gate; a probability of 0 refuses nothing."""
+    f = sensors.filter
+    return chi_square_gate(f.gate_probability, reopen_after=f.reopen_after) if f.gate_probability else no_gate()
 
 
 def _inputs(
@@ -227,7 +219,7 @@ def _start(
 
 
 def _refused(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate) -> list[Problem]:
-    """Measurements that the gate did not take."""
+    """Measurements that the gate did not take, and those taken because it had refused too many in a row."""
     limits = np.asarray(gate.limits)
     out = []
     for k in np.flatnonzero(updates.status != ACCEPTED):
@@ -236,7 +228,8 @@ def _refused(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate) -
         where = f"{off:.4g} arcsec from what the gyro leads to, " if np.isfinite(off) else ""
         limit = limits[updates.dof[k]]
         message = f"a jump: {where}NIS {updates.nis[k]:.4g} over the gate's {limit:.4g}"
-        out.append(Problem(epochs.files[epochs.file[e]], int(epochs.row[e]), "jump", message, "dropped"))
+        action = "used, its sigma enlarged" if updates.status[k] == FORCED else "dropped"
+        out.append(Problem(epochs.files[epochs.file[e]], int(epochs.row[e]), "jump", message, action))
     return out
 
 
