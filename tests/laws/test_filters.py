@@ -1291,13 +1291,16 @@ def iterated_data():
     return q, P, z, stars, mask
 
 
-@compiled
-def _iterate(q, P, z, stars, mask):
-    filter = ErrorStateKalmanFilter(so3_left, "jacobian", iterations=12)
+@partial(compiled, static_argnames=("side",))
+def _iterate(q, P, z, stars, mask, side):
+    """With the default carry. `side`: a retraction of the attitude alone, or "product" of the left one and a drift."""
+    whole = side == "product"
+    filter = ErrorStateKalmanFilter(product(AttitudeDrift, so3_left, euclidean(3)) if whole else side, iterations=12)
 
     def one(q, P, z, stars, mask):
         m = Measurement(z, stars, mask)
-        return filter.update(Gaussian(q, P), star_directions(SIGMA_I), m, no_gate(), jnp.asarray(0))
+        mean = AttitudeDrift(q, jnp.zeros(3)) if whole else q
+        return filter.update(Gaussian(mean, P), star_directions(SIGMA_I), m, no_gate(), jnp.asarray(0))
 
     return jax.vmap(one)(q, P, z, stars, mask)
 
@@ -1326,21 +1329,42 @@ def numpy_left_jacobian(xi) -> np.ndarray:
     return expm(np.block([[hat(xi), np.eye(3)], [np.zeros((3, 6))]]))[:3, 3:]
 
 
-def test_iterated_update_finds_the_posterior_and_uses_the_measurement_once():
+DRIFT_OF_TURN = np.array([[0.3, -0.1, 0.0], [0.2, 0.4, -0.3], [0.0, 0.1, 0.2]])
+DRIFT_ALONE = np.diag([0.01, 0.02, 0.03])
+
+
+def with_drift(C) -> np.ndarray:
+    """Covariance (6, 6) of an attitude error with covariance C (3, 3) and a drift that follows it linearly."""
+    M = DRIFT_OF_TURN
+    return np.block([[C, C @ M.T], [M @ C, M @ C @ M.T + DRIFT_ALONE]])
+
+
+@pytest.mark.parametrize("side", [so3_left, so3_right, "product"], ids=["left", "right", "product"])
+def test_iterated_update_finds_the_posterior_and_uses_the_measurement_once(side):
     data = iterated_data()
-    belief, info = numpy_of(_iterate(*(jnp.asarray(a) for a in data)))
+    q, P, *rest = data
+    R = Rotation.from_quat(q).as_matrix()
+    if side is so3_right:  # the same prior in axes of N
+        P = R.transpose(0, 2, 1) @ P @ R
+    elif side == "product":
+        P = np.stack([with_drift(p) for p in P])
+    belief, info = numpy_of(_iterate(*(jnp.asarray(a) for a in (q, P, *rest)), side=side))
     assert np.all(info.status == ACCEPTED)
     for c in range(ITERATED):
-        q = data[0][c]
         xi, J = map_estimate(*(a[c] for a in data))
-        expected = Rotation.from_rotvec(xi) * Rotation.from_quat(q)
-        assert (Rotation.from_quat(belief.mean[c]) * expected.inv()).magnitude() < 1e-7
+        expected = Rotation.from_rotvec(xi) * Rotation.from_quat(q[c])
+        q_c = belief.mean.q_BN[c] if side == "product" else belief.mean[c]
+        assert (Rotation.from_quat(q_c) * expected.inv()).magnitude() < 1e-7
         # Its covariance is the inverse Fisher information of prior and ONE measurement, carried to the new mean by J_l.
-        J_l = numpy_left_jacobian(xi)
-        bound = J_l @ np.linalg.inv(J) @ J_l.T
-        assert worst_covariance(belief.cov[c], bound) < 1e-6
-        s = np.sqrt(np.diag(bound))
-        assert np.min(np.linalg.eigvalsh((belief.cov[c] - bound) / np.outer(s, s))) > -1e-6
+        J_l, found = numpy_left_jacobian(xi), belief.cov[c]
+        bound = np.linalg.inv(J)
+        if side == "product":
+            assert worst(belief.mean.b[c], DRIFT_OF_TURN @ xi) < 1e-6
+            bound, J_l = with_drift(bound), np.block([[J_l, np.zeros((3, 3))], [np.zeros((3, 3)), np.eye(3)]])
+        elif side is so3_right:
+            R_new = Rotation.from_quat(q_c).as_matrix()
+            found = R_new @ found @ R_new.T
+        assert worst_covariance(found, J_l @ bound @ J_l.T) < 1e-6
 
 
 def test_one_plain_step_is_not_the_posterior_there():

@@ -9,7 +9,8 @@
 
 Iterated update (Bell and Cathey 1993): Gauss-Newton on the posterior with the prior kept at the predicted mean, so that
 the measurement enters once however many iterations are made: with d_i = x_i [-] x', K_i at x_i,
-d_{i+1} = K_i (e_i + H_i d_i). H_i is the derivative by d at d_i.
+d_{i+1} = K_i (e_i + H_i d_i). H_i is the derivative by d at d_i, so P+ lives in the coordinates of d and goes to the tangent
+space at the new mean by their Jacobian, not by transport.
 
 Masked measurement entries: their residuals are replaced before any arithmetic, their rows of H are zero and they have a
 unit diagonal in S, so that they add nothing to NIS, gain or likelihood.
@@ -128,7 +129,10 @@ def information(e: Array, S: Array, V: Array, rows: Array, nis: Array, dof: Arra
 
 @dataclass(frozen=True)
 class ErrorStateKalmanFilter:
-    """EKF over any retraction. `iterations` > 1 iterates the update without using the measurement again."""
+    """EKF over any retraction. `iterations` > 1 iterates the update without using the measurement again.
+
+    carry: see `carry_covariance`; an iterated update with "transport" carries by the Jacobian, as its covariance asks for.
+    """
 
     retraction: Retraction
     carry: Carry = "transport"
@@ -179,7 +183,8 @@ class ErrorStateKalmanFilter:
         K = jnp.where(used, K, jnp.zeros_like(K))
         A = jnp.eye(r.dim, dtype=P.dtype) - small.matmul(K, H)
         cov = small.congruence(A, P_grown) + small.congruence(K, doubt(R, nis, dof, status))
-        return Gaussian(r.boxplus(x, d), carry_covariance(r, self.carry, x, d, cov)), info
+        how = "jacobian" if self.carry == "transport" and self.iterations > 1 else self.carry
+        return Gaussian(r.boxplus(x, d), carry_covariance(r, how, x, d, cov)), info
 
     def _sensor_jacobian(self, sensor: Sensor, x: Any, m: Measurement, rows: Array, d: Array) -> Array:
         """H = d h(x [+] d)/d d with the rows of absent entries zero."""
