@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,12 +10,18 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from helmstar.backend import jax
 from helmstar.campaign import engine as engine_module
 from helmstar.campaign import run_campaign
 from helmstar.campaign.engine import Engine
+from helmstar.campaign.programs import _stored, compiled, exported
 from helmstar.campaign.runner import choose
 from helmstar.errors import CampaignError, ConfigurationError
+from helmstar.filters import ErrorStateKalmanFilter
+from helmstar.geometry.retraction import euclidean, product, so3_left, so3_right
+from helmstar.models.attitude import AttitudeDrift
 from helmstar.scenarios import build, load
+from helmstar.scenarios.experiment import Call
 
 SMALL = {"updates": 20, "width": 4}
 
@@ -231,6 +238,40 @@ def test_tunings_and_twins_share_programs():
     assert len(engine._jobs) == 8
     other, _ = prepared(tuning__q_w=1e-4, star__sigma_arcsec=3)
     assert set(Engine(other, other.estimators)._jobs) == set(engine._jobs)
+
+
+def _a_users(factor):
+    def add(a, data):
+        return {"x": factor * a.sum() + data.sum()}
+
+    return add
+
+
+def test_a_users_function_that_changed_is_traced_again():
+    """Nothing but its meaning differs: same module, same name. A kept program would give the first result again."""
+    results = [compiled(exported(Call(_a_users(f), (np.ones(3),)), np.ones(2)))(np.ones(3), np.ones(2)) for f in (1, 7)]
+    assert [float(r[0]) for r in results] == [5.0, 23.0]
+
+
+def test_programs_are_kept_only_for_what_is_helmstars_alone(monkeypatch, tmp_path):
+    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", str(tmp_path))
+    experiment, _ = prepared()
+    paths = {n: _stored(call, None) for n, call in experiment.estimators.items()}
+    assert None not in paths.values()
+    assert len(set(paths.values())) == 7  # as many as there are programs
+    call = experiment.estimators["lie"]
+    assert _stored(call, None) == _stored(prepared()[0].estimators["lie"], None)
+    model, *rest = call.arguments
+    (sensor,) = model.sensors
+    mine = dataclasses.replace(sensor, minus=lambda z, z_hat: (z - z_hat).reshape(-1))
+    assert _stored(Call(call.function, (dataclasses.replace(model, sensors=(mine,)), *rest), call.static), None) is None
+    # What a function of helmstar's closes over counts: products differ by their parts, and a part may be a user's.
+    foreign = dataclasses.replace(so3_left, boxplus=_a_users(1))
+    with_parts = [product(AttitudeDrift, part, euclidean(3)) for part in (so3_left, so3_right, foreign)]
+    found = [_stored(Call(call.function, (), {"filter": ErrorStateKalmanFilter(p)}), None) for p in with_parts]
+    assert found[0] != found[1]
+    assert None not in found[:2]
+    assert found[2] is None
 
 
 def test_unknown_estimators_are_named():

@@ -2,16 +2,20 @@
 
 Tracing and lowering a filter costs as much as loading its executable. So a call is exported to StableHLO (JAX's portable
 format, no pickle) and kept beside the compilation cache, under a name that is a hash of all that it depends on: the sources of
-helmstar, JAX's version, the call's function, statics and shapes. What cannot be read is traced again.
+helmstar, JAX's version, the call's function and every static value that its statics, arguments and data hold, functions by
+their place in the sources, with what they close over. Only helmstar's own sources are hashed: a call with a function or class
+from elsewhere (a user's, a test's) is traced anew each time. What cannot be read is traced again.
 """
 
 from __future__ import annotations
 
 import hashlib
+import inspect
 import os
-import re
-from functools import cache
+from dataclasses import fields, is_dataclass
+from functools import cache, partial
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 from ..backend import compile_program, jax, jnp
@@ -63,15 +67,66 @@ def _shape(a: Any) -> Any:
 
 
 def _stored(call: Call, data: Any) -> Path | None:
-    """Where the exported call is kept; None without a compilation cache."""
+    """Where the exported call is kept; None without a compilation cache, or for a call that is not helmstar's alone."""
     folder = jax.config.values.get("jax_compilation_cache_dir")
     if not folder:
         return None
-    statics = sorted(call.static.items())
-    name = f"{call.function.__module__}.{call.function.__qualname__}"
-    text = repr((_sources(), jax.__version__, jax.default_backend(), name, statics, signature((call.arguments, data))))
-    text = re.sub(r" at 0x[0-9a-f]+", "", text)  # functions by name: their addresses change
+    tree = (call.arguments, data)
+    try:
+        what = [_described(v) for v in (call.function, dict(call.static))]
+        structure = _structure(jax.tree.structure(tree))
+    except _NotOurs:
+        return None
+    text = repr((_sources(), jax.__version__, jax.default_backend(), what, structure, signature(tree)[1]))
     return Path(folder) / "helmstar" / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.stablehlo"
+
+
+class _NotOurs(Exception):
+    """A static value whose meaning is not in helmstar's sources."""
+
+
+def _structure(tree: Any) -> Any:
+    """Of a tree: its node types with their static data."""
+    node = tree.node_data()
+    return node if node is None else (_described(node), [_structure(child) for child in tree.children()])
+
+
+def _described(value: Any, within: tuple[int, ...] = ()) -> Any:
+    """A static value in words that are equal for equal meanings in any process. Raises _NotOurs where that is not known.
+
+    within: identities of the functions around it, which may close over themselves.
+    """
+    if value is None or isinstance(value, bool | int | float | complex | str | bytes):
+        return repr(value)
+    if id(value) in within:
+        return f"around {len(within) - within.index(id(value))}"
+    within = (*within, id(value))
+    if isinstance(value, type):
+        if value.__module__ != "builtins" and not _ours(value.__module__):
+            raise _NotOurs
+        return value.__module__, value.__qualname__
+    if isinstance(value, partial):
+        return "partial", [_described(v, within) for v in (value.func, value.args, value.keywords)]
+    if isinstance(value, dict):
+        return "dict", [(_described(k, within), _described(v, within)) for k, v in value.items()]
+    if isinstance(value, tuple | list):
+        return _described(type(value)), [_described(v, within) for v in value]
+    if is_dataclass(value):
+        return _described(type(value)), [(f.name, _described(getattr(value, f.name), within)) for f in fields(value)]
+    if type(value) is _JITTED:
+        return "jit", _described(inspect.unwrap(value), within)
+    if not isinstance(value, FunctionType) or not _ours(value.__globals__["__name__"]):
+        raise _NotOurs
+    code, cells = value.__code__, [c.cell_contents for c in value.__closure__ or ()]
+    place = (value.__module__, value.__qualname__, code.co_firstlineno, code.co_code)
+    return place, [_described(v, within) for v in (cells, value.__defaults__, value.__kwdefaults__)]
+
+
+def _ours(module: str) -> bool:
+    return module == "helmstar" or module.startswith("helmstar.")
+
+
+_JITTED = type(jax.jit(lambda: None))
 
 
 @cache
