@@ -85,19 +85,30 @@ def parser() -> argparse.ArgumentParser:
         help="attitude and gyro drift from telemetry: gyro rates and star-tracker attitudes or star directions",
         description="""Filter and smooth attitude and gyro drift (6 states) from CSV or Parquet telemetry.
 Native columns: time_s; gyro_x_rad_s, gyro_y_rad_s, gyro_z_rad_s; q_bn_x, q_bn_y, q_bn_z, q_bn_w (scalar last, N to B).
-They may stand in one table or in two; other layouts are mapped by [columns] in the configuration (docs/telemetry.md).""",
+They may stand in one table or in two; other layouts are mapped by [columns] in the configuration (docs/telemetry.md).
+GRACE-FO Level-1 (SCA1A, SCA1B, IMU1A, IMU1B), CCSDS AEM, STK .a and SPICE CK files are read as they are.""",
         epilog="""examples:
   helmstar attitude telemetry.csv
+  helmstar attitude SCA1B_2022-01-01_C_04.txt IMU1B_2022-01-01_C_04.txt
+  helmstar attitude gyro.csv attitude.aem --aem --ck --out flight
   helmstar attitude gyro.csv startracker.parquet --config sensors.toml --out flight
   helmstar attitude gyro.csv stars.csv --config sensors.toml --json > summary.json""",
         formatter_class=raw,
     )
-    c.add_argument("files", nargs="+", metavar="FILE", help="CSV or Parquet tables")
+    c.add_argument("files", nargs="+", metavar="FILE", help="CSV or Parquet tables, GRACE-FO, AEM, STK or CK files")
     c.add_argument(
         "--config", metavar="TOML", help="sensors.toml: columns, noise, mounting, gate (see docs/telemetry.md)"
     )
     c.add_argument("--strict", action="store_true", help="a bad row is an error instead of being dropped and reported")
     c.add_argument("--csv", action="store_true", help="write tables as CSV instead of Parquet")
+    c.add_argument(
+        "--aem", action="store_true", help="write the smoothed attitude as CCSDS AEM too: attitude.aem (needs dates)"
+    )
+    c.add_argument(
+        "--ck",
+        action="store_true",
+        help='write it as SPICE CK too: attitude.bc with .tsc and .tls (pip install "helmstar[spice]")',
+    )
     _common(c, "helmstar-out/attitude-FILE")
     c.set_defaults(call=_attitude)
 
@@ -236,6 +247,8 @@ def _attitude(args: argparse.Namespace) -> int:
         strict=args.strict,
         as_csv=args.csv,
         command=_command(args),
+        aem=args.aem,
+        ck=args.ck,
     )
     if args.json:
         _print_json(result)

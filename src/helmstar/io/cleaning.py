@@ -55,6 +55,11 @@ def clean(table: Table, maps: Sequence[ColumnsConfiguration], log: ProblemLog) -
     """Understand a table's columns by `maps` or native names, and note every bad row in `log`."""
     layout = resolve(table.file, list(table.columns), map_for(table.file, maps))
     instants, timed = _times(table, layout, log)
+    return clean_timed(table, layout, instants, timed, log)
+
+
+def clean_timed(table: Table, layout: Layout, instants: Instants, timed: np.ndarray, log: ProblemLog) -> Part:
+    """A table whose columns and times are known, with the rows (a mask) that have a time; notes bad rows in `log`."""
     timed = _in_time_order(table, instants, timed, log)
     star = layout.star_b + layout.star_n
     wanted = [names for names in (layout.gyro, layout.quaternion, star) if names]
@@ -178,7 +183,7 @@ def _in_time_order(table: Table, instants: Instants, timed: np.ndarray, log: Pro
     """Of the rows with a time drop the fewest that leave it never going back; later ones rather than earlier."""
     index = np.flatnonzero(timed)
     time = instants.select(index).seconds()
-    keep = _longest_without_decrease(time)
+    keep = longest_without_decrease(time)
     kept_so_far = np.maximum.accumulate(np.where(keep, np.arange(len(keep)), -1))
     step = np.where(kept_so_far >= 0, time - time[kept_so_far], np.inf)[~keep]
 
@@ -192,7 +197,7 @@ def _in_time_order(table: Table, instants: Instants, timed: np.ndarray, log: Pro
     return stays
 
 
-def _longest_without_decrease(time: np.ndarray) -> np.ndarray:
+def longest_without_decrease(time: np.ndarray) -> np.ndarray:
     """Mask of a longest non-decreasing subsequence (patience sorting from the end, so that earlier rows win ties)."""
     if (np.diff(time) >= 0.0).all():
         return np.ones(len(time), dtype=bool)

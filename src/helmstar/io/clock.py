@@ -27,6 +27,7 @@ Scale = Literal["s", "utc", "tai", "gps", "unix"]
 
 DAY_S = 86400.0
 TAI_MINUS_GPS_S = 19.0
+TT_MINUS_TAI_S = 32.184
 _JD_2000 = 2451544.5  # Julian date of 2000-01-01T00:00, where the days of `Instants` begin
 _EPOCH_2000 = np.datetime64("2000-01-01", "D")
 _FARTHEST_DATE_S = 1e11  # 3000 years: beyond it a number is no time of telemetry
@@ -49,23 +50,23 @@ class Origin:
     def __str__(self) -> str:
         return f"{self.utc([0.0])[0]} UTC" if self.absolute else f"{self.second:.6f} s of the files' clock"
 
-    def tai(self, time: np.ndarray | list[float]) -> list[str]:
-        """`time`, s since the origin, as ISO 8601 TAI with microseconds. Only where `absolute`."""
-        return self._iso("TAI", time)
+    def tai(self, time: np.ndarray | list[float], digits: int = 6) -> list[str]:
+        """`time`, s since the origin, as ISO 8601 TAI with up to 9 digits of a second. Only where `absolute`."""
+        return self._iso("TAI", time, digits)
 
-    def utc(self, time: np.ndarray | list[float]) -> list[str]:
-        """`time`, s since the origin, as ISO 8601 UTC with microseconds. Only where `absolute`."""
-        return self._iso("UTC", time)
+    def utc(self, time: np.ndarray | list[float], digits: int = 6) -> list[str]:
+        """`time`, s since the origin, as ISO 8601 UTC with up to 9 digits of a second. Only where `absolute`."""
+        return self._iso("UTC", time, digits)
 
-    def _iso(self, scale: str, time: np.ndarray | list[float]) -> list[str]:
+    def _iso(self, scale: str, time: np.ndarray | list[float], digits: int) -> list[str]:
         if not self.absolute:
             raise ValueError("a clock of plain seconds has no calendar")
         jd, fraction = np.full(len(time), _JD_2000 + self.day), (np.asarray(time, dtype=float) + self.second) / DAY_S
         if scale == "UTC":
             jd, fraction = erfa.taiutc(jd, fraction)
-        year, month, day, clock = erfa.d2dtf(scale, 6, jd, fraction)
+        year, month, day, clock = erfa.d2dtf(scale, digits, jd, fraction)
         return [
-            f"{y:04d}-{m:02d}-{d:02d}T{c['h']:02d}:{c['m']:02d}:{c['s']:02d}.{c['f']:06d}"
+            f"{y:04d}-{m:02d}-{d:02d}T{c['h']:02d}:{c['m']:02d}:{c['s']:02d}.{c['f']:0{digits}d}"
             for y, m, d, c in zip(year, month, day, clock)
         ]
 
@@ -150,6 +151,12 @@ def from_texts(text: pa.ChunkedArray | pa.Array, scale: Scale) -> tuple[Instants
     return Instants(np.where(good, day, 0), total, absolute=True), good
 
 
+def leap_seconds() -> list[tuple[int, int, float]]:
+    """Year, month and TAI - UTC in s from the first day of that month on, since 1972."""
+    table = erfa.leap_seconds.get()
+    return [(int(row["year"]), int(row["month"]), float(row["tai_utc"])) for row in table if row["year"] >= 1972]
+
+
 def tai_minus_utc(day: np.ndarray) -> np.ndarray:
     """TAI - UTC in s during UTC days (counted from 2000-01-01); NaN before 1972."""
     start, offset = _leap_seconds()
@@ -159,9 +166,8 @@ def tai_minus_utc(day: np.ndarray) -> np.ndarray:
 
 @cache
 def _leap_seconds() -> tuple[np.ndarray, np.ndarray]:
-    table = erfa.leap_seconds.get()
-    table = table[table["year"] >= 1972]
-    return np.array([_day(int(y), int(m), 1) for y, m in zip(table["year"], table["month"])]), table["tai_utc"]
+    table = leap_seconds()
+    return np.array([_day(year, month, 1) for year, month, _ in table]), np.array([offset for *_, offset in table])
 
 
 def _day(year: int, month: int, day: int) -> int:

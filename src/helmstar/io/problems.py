@@ -15,8 +15,9 @@ class Problem:
     """One bad row of a file. `row` is the line number in a CSV (1-based), the data row (1-based) in Parquet.
 
     kind: "nan", "not_a_number", "ragged", "non_unit", "time_unreadable", "time_backwards", "time_repeated", "frame",
-    "jump" or "unit". action: "dropped", "normalised" or "converted". `rows` is how many rows it stands for: 1, or more
-    where a file has so many of a kind that the rest are summed up, or where a whole range is concerned.
+    "jump", "unit" or "flagged". action: "dropped", "normalised" or "converted"; "used" and "not used" are of good rows.
+    `rows` is how many rows it stands for: 1, or more where a file has so many of a kind that the rest are summed up, or
+    where a whole range is concerned.
     """
 
     file: str
@@ -59,8 +60,19 @@ class ProblemLog:
         return tuple(sorted(everything, key=lambda problem: (order[problem.file], problem.row)))
 
 
+NO_FAULT = ("used", "not used")
+"""Actions on rows that are worth a word and still good, so that strict reading lets them pass."""
+
+
+def for_one(problems: Sequence[Problem]) -> str:
+    """The first problem with a dropped row as the end of a message, or nothing."""
+    bad = [problem for problem in problems if problem.action == "dropped"]
+    return f"; for one, {bad[0]}" if bad else ""
+
+
 def refuse(problems: Sequence[Problem], show: int = 5) -> None:
-    """Raise a DataError that lists the first few problems, if there are any: what `--strict` does."""
+    """Raise a DataError that lists the first few problems with bad rows, if there are any: what `--strict` does."""
+    problems = [problem for problem in problems if problem.action not in NO_FAULT]
     if problems:
         total = sum(problem.rows for problem in problems)
         lines = [f"  {problem}" for problem in problems[:show]]

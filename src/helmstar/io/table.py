@@ -118,7 +118,7 @@ def _read_parquet(file: Path) -> Table:
 
 
 def _read_csv(file: str, content: bytes, max_problems: int) -> Table:
-    lines = _lines(content)
+    lines = text_lines(content)
     first = next((i for i, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
     if first is None:
         empty = "the file is empty" if not content.strip() else "the file has nothing but comments and blank lines"
@@ -143,7 +143,7 @@ def _read_csv(file: str, content: bytes, max_problems: int) -> Table:
     )
 
 
-def _lines(content: bytes) -> list[str]:
+def text_lines(content: bytes) -> list[str]:
     """Text lines, so that index + 1 is the line number an editor shows. Undecodable bytes become U+FFFD."""
     encoding = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     text = content.decode(encoding, errors="replace").replace("\r\n", "\n")

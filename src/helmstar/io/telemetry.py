@@ -14,11 +14,12 @@ from typing import Literal, Self
 import numpy as np
 
 from ..errors import DataError
-from .cleaning import SAME_TIME_S, Part, clean
+from .cleaning import SAME_TIME_S, Part
 from .clock import Instants, Origin
 from .columns import ColumnsConfiguration
+from .formats import read_part
 from .problems import Problem, ProblemLog, refuse
-from .table import read_table
+from .settings import FormatSettings
 
 __all__ = [
     "AttitudeRows",
@@ -115,12 +116,13 @@ def read_telemetry(
     strict: bool = False,
     needs: Sequence[Literal["gyro", "star"]] = ("gyro", "star"),
     max_problems: int = 1000,
+    settings: FormatSettings | None = None,
 ) -> Telemetry:
-    """Read CSV or Parquet tables into one telemetry.
+    """Read tables (CSV, Parquet) and files of the formats that `formats` knows into one telemetry.
 
-    `columns`: one map for all files, or several with a `file` pattern each. `needs`: what must be there, "star" being
-    attitudes or star directions. With `strict` any bad row is a DataError; otherwise bad rows are listed in `problems`,
-    per file and kind the first `max_problems` by row.
+    `columns`: one map for all tables, or several with a `file` pattern each; `settings` are for the formats. `needs`:
+    what must be there, "star" being attitudes or star directions. With `strict` any bad row is a DataError; otherwise bad
+    rows are listed in `problems`, per file and kind the first `max_problems` by row.
     """
     maps = [] if columns is None else [columns] if isinstance(columns, ColumnsConfiguration) else list(columns)
     names = [str(file) for file in files]
@@ -130,7 +132,7 @@ def read_telemetry(
         if names.count(name) > 1:
             raise DataError(f"{name}: the file is given twice; name each file once")
     log = ProblemLog(max_problems)
-    parts = [clean(read_table(Path(name), max_problems), maps, log) for name in names]
+    parts = [read_part(Path(name), maps, log, settings, max_problems) for name in names]
     origin = _common_origin(parts)
 
     gyro = _gyro_rows(parts, origin, log)

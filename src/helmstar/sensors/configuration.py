@@ -26,6 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from ..configuration import explain, read_toml
 from ..errors import ConfigurationError
 from ..io.columns import ColumnsConfiguration
+from ..io.settings import AemConfiguration, FormatSettings, GraceFoConfiguration, SpiceConfiguration
 
 DEG = math.pi / 180.0
 ARCSEC = DEG / 3600.0
@@ -174,6 +175,13 @@ class SensorsConfiguration(_Table):
     gyro: GyroConfiguration = GyroConfiguration()
     star: StarConfiguration = StarConfiguration()
     filter: FilterConfiguration = FilterConfiguration()
+    gracefo: GraceFoConfiguration = GraceFoConfiguration()
+    aem: AemConfiguration = AemConfiguration()
+    spice: SpiceConfiguration = SpiceConfiguration()
+
+    def formats(self, folder: Path | None = None) -> FormatSettings:
+        """What the readers of other formats need; relative file names may be meant from `folder`."""
+        return FormatSettings(self.gracefo, self.spice, folder)
 
     @field_validator("columns", mode="before")
     @classmethod

@@ -19,6 +19,7 @@ from ..io.telemetry import Telemetry, read_telemetry
 from ..sensors.configuration import load_sensors
 from ..versions import versions
 from .estimate import Estimates
+from .export import check_export, write_exports
 from .solve import ARCSEC, Solution, solve
 
 STATUS = {ACCEPTED: "accepted", GATED: "gated", REOPENED: "reopened", FORCED: "forced"}
@@ -144,11 +145,21 @@ def result_of(solution: Solution, telemetry: Telemetry, files: Sequence[Path], c
 
 
 def run_attitude(
-    files: Sequence[Path], *, config: Path | None, folder: Path, strict: bool, as_csv: bool, command: str
+    files: Sequence[Path],
+    *,
+    config: Path | None,
+    folder: Path,
+    strict: bool,
+    as_csv: bool,
+    command: str,
+    aem: bool = False,
+    ck: bool = False,
 ) -> tuple[dict[str, Any], Path]:
     """The whole command: returns the object of `--json` and the report's path. Raises HelmstarError."""
     sensors = load_sensors(config)
-    telemetry = read_telemetry(files, sensors.columns or None, strict=strict)
+    settings = sensors.formats(None if config is None else Path(config).parent)
+    telemetry = read_telemetry(files, sensors.columns or None, strict=strict, settings=settings)
+    check_export(telemetry.origin, aem=aem, ck=ck)
     solution = solve(telemetry, sensors, strict, progress=True)
     result = result_of(solution, telemetry, files, command)
     if config is not None:
@@ -170,6 +181,8 @@ def run_attitude(
         os.replace(part, path)
         tables[name] = str(path)
     result["tables"] = tables
+    if aem or ck:
+        result["exports"] = write_exports(solution, telemetry.origin, sensors, folder, aem=aem, ck=ck, command=command)
     from ..report.telemetry import write_telemetry_report
 
     report = write_telemetry_report(result, frames, folder / "report.html")

@@ -1,0 +1,73 @@
+"""The smoothed attitude of a record in the formats of other programs: CCSDS AEM and SPICE CK."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import DataError
+from ..io.clock import Origin
+from ..io.screening import find_gaps
+from ..sensors.configuration import SensorsConfiguration
+from .solve import Solution
+
+
+def _segments(time: np.ndarray) -> list[slice]:
+    """Stretches of increasing times without a gap in them."""
+    starts = [0, *(int(np.searchsorted(time, gap.end)) for gap in find_gaps(time))]
+    return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(time)])]
+
+
+def body_rate(solution: Solution, part: slice) -> np.ndarray:
+    """Rate of B relative to N in B (m, 3), rad/s, at the times of a stretch: the mean of the gyro's steps before and after
+    each within the stretch, less the drift."""
+    rate = solution.timeline.rate
+    low = min(part.start, len(rate) - 1)
+    high = max(part.stop - 2, low)
+    at = np.arange(part.start, part.stop)
+    beside = rate[np.clip(at - 1, low, high)] + rate[np.clip(at, low, high)]
+    return 0.5 * beside - solution.smoothed.drift[part]
+
+
+def write_exports(
+    solution: Solution,
+    origin: Origin,
+    sensors: SensorsConfiguration,
+    folder: Path,
+    *,
+    aem: bool,
+    ck: bool,
+    command: str,
+) -> dict[str, str]:
+    """Smoothed attitude as CCSDS AEM and SPICE CK where asked for; names of the files by what they are."""
+    out: dict[str, str] = {}
+    time, q_BN = solution.timeline.time, solution.smoothed.q_BN
+    parts = _segments(time)
+    comments = ["Attitude estimated by helmstar from gyro and star tracker telemetry, smoothed.", command]
+    if aem:
+        from ..io.aem import write_aem
+
+        path = folder / "attitude.aem"
+        write_aem(path, origin, [(time[p], q_BN[p]) for p in parts], sensors.aem, comments)
+        out["aem"] = str(path)
+    if ck:
+        from ..io.spice_ck import CkSegment, write_ck
+
+        segments = [CkSegment(time[p], q_BN[p], body_rate(solution, p)) for p in parts]
+        files = write_ck(folder / "attitude.bc", origin, segments, sensors.spice, comments)
+        out |= dict(zip(("ck", "sclk", "lsk"), map(str, files)))
+    return out
+
+
+def check_export(origin: Origin, *, aem: bool, ck: bool) -> None:
+    """Raise the DataErrors of an export before the work, not after it."""
+    if (aem or ck) and not origin.absolute:
+        raise DataError(
+            f"{'--aem' if aem else '--ck'} needs absolute times, and the files count plain seconds; give time_utc, or say "
+            'what the seconds count: [columns] clock_scale = "unix", "gps" or "tai"'
+        )
+    if ck:
+        from ..io.spice_kernels import spice
+
+        spice()
