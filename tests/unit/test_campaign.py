@@ -13,9 +13,12 @@ import xarray as xr
 from helmstar.backend import jax
 from helmstar.campaign import engine as engine_module
 from helmstar.campaign import run_campaign
+from helmstar.campaign import runner as runner_module
+from helmstar.campaign import store as store_module
 from helmstar.campaign.engine import Engine
 from helmstar.campaign.programs import _stored, compiled, exported
 from helmstar.campaign.runner import choose
+from helmstar.campaign.store import Store
 from helmstar.errors import CampaignError, ConfigurationError
 from helmstar.filters import ErrorStateKalmanFilter
 from helmstar.geometry.retraction import euclidean, product, so3_left, so3_right
@@ -24,6 +27,7 @@ from helmstar.scenarios import build, load
 from helmstar.scenarios.experiment import Call
 
 SMALL = {"updates": 20, "width": 4}
+MANIFEST = {"specification": {"width": 4}, "runs": 7, "estimators": ["lie"], "helmstar_version": "0"}
 
 
 def prepared(**overrides):
@@ -223,6 +227,44 @@ def test_resume_without_a_campaign_or_with_a_damaged_manifest(tmp_path):
     (tmp_path / "campaign.json").write_text("{")
     with pytest.raises(CampaignError, match="damaged"):
         run(tmp_path, 4, resume=True)
+
+
+def test_only_a_campaigns_own_blocks_are_deleted(tmp_path):
+    foreign = tmp_path / "blocks" / "house.nc"
+    foreign.parent.mkdir()
+    foreign.write_text("mine")
+    with pytest.raises(CampaignError, match=r"blocks holds \.nc files"):
+        Store(tmp_path, MANIFEST, resume=False)
+    assert foreign.read_text() == "mine"
+    (tmp_path / "campaign.json").write_text(json.dumps(MANIFEST))
+    for name in ("000000.nc", "000001.nc", "12.nc", "²²²²²².nc"):
+        (tmp_path / "blocks" / name).write_text("x")
+    store = Store(tmp_path, MANIFEST, resume=False)
+    assert store.discarded == "7 finished runs"
+    assert {f.name for f in foreign.parent.iterdir()} == {"house.nc", "12.nc", "²²²²²².nc"}
+    assert Store(tmp_path, MANIFEST, resume=False).discarded == ""
+    (tmp_path / "blocks" / "000000.nc").write_text("x")
+    (tmp_path / "campaign.json").write_text("{")
+    assert Store(tmp_path, MANIFEST, resume=False).discarded == "1 finished block"
+
+
+def test_the_blocks_kept_in_memory_are_bounded(tmp_path, monkeypatch, eleven):
+    monkeypatch.setattr(store_module, "KEPT_BYTES", 0)
+    opened = []
+    read = xr.open_dataset
+    monkeypatch.setattr(xr, "open_dataset", lambda path, **k: (opened.append(path), read(path, **k))[1])
+    assert same_bits(run(tmp_path, 11).dataset, eleven.dataset)
+    assert len(opened) == 3
+
+
+def test_the_finished_blocks_are_listed_a_fixed_number_of_times(tmp_path, monkeypatch):
+    listed = []
+    finished = Store.finished
+    monkeypatch.setattr(Store, "finished", lambda self: (listed.append(1), finished(self))[1])
+    monkeypatch.setattr(runner_module, "_compute", lambda *_: True)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, 400)
+    assert len(listed) <= 3
 
 
 def test_an_output_folder_that_cannot_be_written(tmp_path):

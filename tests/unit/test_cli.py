@@ -70,8 +70,9 @@ def test_the_default_folder_is_named_after_scenario_and_seed(capsys, tmp_path, m
 
 def test_a_reused_folder_holds_the_new_campaign(capsys, tmp_path):
     call(capsys, "run", "xu2020", *SMALL, "--out", str(tmp_path), "--json")
-    code, out, _ = call(capsys, "run", "xu2020", *SMALL, "--seed", "2", "--out", str(tmp_path), "--json")
+    code, out, err = call(capsys, "run", "xu2020", *SMALL, "--seed", "2", "--out", str(tmp_path), "--json")
     assert code == 0
+    assert "discarded 3 finished runs of an earlier campaign" in err
     assert json.loads(out)["seed"] == 2
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -73,7 +74,8 @@ def run_campaign(
     specification: the validated keys (for the manifest); configuration: the same as TOML or JSON text for the report;
     command: what reproduces it; batch: runs that a worker takes at a time, rounded up to whole blocks; dask: address of a
     scheduler that computes the blocks instead. Raises CampaignError or ConfigurationError; on Ctrl-C the outcome holds what is
-    finished, and KeyboardInterrupt is raised only when nothing is.
+    finished, and KeyboardInterrupt is raised only when nothing is. Without `resume` an earlier campaign's blocks in `folder` are
+    discarded, which `progress` says on stderr.
     """
     begin = time.perf_counter()
     names = choose(experiment, estimators)
@@ -88,8 +90,11 @@ def run_campaign(
         "command": command,
     }
     store = Store(folder, manifest, resume)
+    if progress and store.discarded:
+        print(f"discarded {store.discarded} of an earlier campaign in {folder}", file=sys.stderr)
     needed = range(-(-runs // experiment.width))
-    todo = [i for i in needed if i not in set(store.finished())]
+    done = set(store.finished())
+    todo = [i for i in needed if i not in done]
     interrupted = False
     with Progress(progress) as bar:
         try:

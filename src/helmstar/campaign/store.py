@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,9 @@ import xarray as xr
 from ..errors import CampaignError
 from ..scenarios.experiment import Experiment
 from .engine import Block
+
+KEPT_BYTES = 2**28
+"""How much of what was just written stays in memory, so that it need not be read again."""
 
 
 def fingerprint(manifest: dict[str, Any]) -> str:
@@ -36,25 +40,51 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 class Store:
-    """The folder of one campaign. Raises CampaignError where the folder cannot be used as asked."""
+    """The folder of one campaign. Raises CampaignError where the folder cannot be used as asked.
+
+    discarded: what of an earlier campaign was deleted, in words ("100 finished runs"); empty where nothing was.
+    """
 
     def __init__(self, folder: Path, manifest: dict[str, Any], resume: bool):
         self.folder = folder
         self.blocks = folder / "blocks"
-        self._kept: dict[int, xr.Dataset] = {}  # of this process: what was just written need not be read again
+        self.discarded = ""
+        self._kept: dict[int, xr.Dataset] = {}  # of this process, KEPT_BYTES at most
+        self._room = KEPT_BYTES
         self.manifest = manifest | {"fingerprint": fingerprint(manifest)}
         path = folder / "campaign.json"
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if resume:
                 self._check(path)
-            elif self.blocks.exists():
-                for old in self.blocks.glob("*.nc"):
-                    old.unlink()
+            else:
+                self._discard(path)
             self.blocks.mkdir(exist_ok=True)
             write_atomically(path, json.dumps(self.manifest, indent=2))
         except OSError as error:
             raise CampaignError(f"--out {folder}: cannot write there: {error.strerror or error}") from error
+
+    def _discard(self, path: Path) -> None:
+        """Delete an earlier campaign's blocks: only files that a campaign wrote, so only beside its manifest."""
+        if not path.exists():
+            if any(self.blocks.glob("*.nc")):
+                raise CampaignError(
+                    f"--out {self.folder}: {self.blocks} holds .nc files, but {path.name} is missing, so they may not be "
+                    "helmstar's and are not overwritten; give another --out, or move them away"
+                )
+            return
+        old = self.finished()
+        for index in old:
+            self._path(index).unlink()
+        try:
+            earlier = json.loads(path.read_text(encoding="utf-8"))
+            count = min(len(old) * int(earlier["specification"]["width"]), int(earlier["runs"]))
+            self.discarded = _counted(count, "finished run")
+        except (ValueError, KeyError, TypeError):  # a damaged manifest does not say how many runs a block holds
+            self.discarded = _counted(len(old), "finished block")
+
+    def _path(self, index: int) -> Path:
+        return self.blocks / f"{index:06d}.nc"
 
     def _check(self, path: Path) -> None:
         if not path.exists():
@@ -73,16 +103,18 @@ class Store:
 
     def finished(self) -> list[int]:
         """Numbers of the blocks that are whole."""
-        return sorted(int(f.stem) for f in self.blocks.glob("*.nc") if f.stem.isdigit())
+        return sorted(int(f.stem) for f in self.blocks.glob("*.nc") if re.fullmatch("[0-9]{6}|[1-9][0-9]{6,}", f.stem))
 
     def save(self, block: Block, experiment: Experiment) -> None:
         """Keep a finished block."""
         ds = _dataset(block, experiment)
-        path = self.blocks / f"{block.index:06d}.nc"
+        path = self._path(block.index)
         part = path.with_suffix(".part")
         ds.to_netcdf(part, engine="h5netcdf")
         os.replace(part, path)
-        self._kept[block.index] = ds
+        if ds.nbytes <= self._room:
+            self._room -= ds.nbytes
+            self._kept[block.index] = ds
 
     def load(self, indices: Iterable[int], runs: int) -> xr.Dataset | None:
         """Blocks joined along run, cut to run numbers below `runs`; None when there is none.
@@ -104,11 +136,15 @@ class Store:
             return None
         parts.sort(key=lambda d: int(d["run"].values[0]))
         seconds = np.mean([p["seconds"].values for p in parts], axis=0)
-        steps = parts[0].sizes["run"] * parts[0].sizes["time"]
+        steps = parts[0].sizes["run"] * int(parts[0]["seconds"].attrs["steps"])
         results: list[xr.Dataset] = [p.drop_vars("seconds") for p in parts]
         data = xr.concat(results, "run") if len(results) > 1 else results[0]
         data["us_per_step"] = ("estimator", 1e6 * seconds / steps)
         return data.isel(run=np.flatnonzero(data["run"].values < runs))
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'s' * (count != 1)}" if count else ""
 
 
 def _differences(earlier: dict[str, Any], now: dict[str, Any]) -> str:
@@ -127,19 +163,20 @@ def _dataset(block: Block, experiment: Experiment) -> xr.Dataset:
     names = list(block.arrays)
     variables: dict[str, Any] = {
         key: (
-            ("estimator", "run", "time", *v.dims),
+            ("estimator", "run", *v.dims),
             np.stack([block.arrays[n][key] for n in names]),
             dict(v.attrs),
         )
         for key, v in experiment.variables.items()
     }
-    variables["seconds"] = ("estimator", np.array([block.seconds[n] for n in names]), {"units": "s"})
-    steps = len(experiment.time)
+    seconds = np.array([block.seconds[n] for n in names])
+    variables["seconds"] = ("estimator", seconds, {"units": "s", "steps": experiment.steps})
     coords = {
         "run": block.runs,
         "time": ("time", experiment.time, {"units": "s", "long_name": "time after the start"}),
-        "update": ("time", np.arange(1, steps + 1), {"long_name": "number of the measurement, from 1"}),
+        "update": ("time", experiment.update, {"long_name": "number of the measurement, from 1"}),
         "estimator": names,
         "axis": ["x", "y", "z"],
+        **experiment.coordinates,
     }
     return xr.Dataset(variables, coords)
