@@ -140,13 +140,12 @@ class Gate:
 class Filter(Protocol):
     """Pure functions over a belief. A filter is hashable, so that equal filters share one compiled program."""
 
-    retraction: Retraction
+    @property
+    def retraction(self) -> Retraction: ...
 
     def predict(self, belief: Any, process: Process, u: Any, dt: Array) -> tuple[Any, Predicted]: ...
 
-    def update(
-        self, belief: Any, sensor: Sensor, measurement: Measurement, gate: Gate, refused: Array
-    ) -> tuple[Any, Info]: ...
+    def update(self, belief: Any, sensor: Sensor, m: Measurement, gate: Gate, refused: Array) -> tuple[Any, Info]: ...
 
 
 @pytree_with(static=("retraction",))

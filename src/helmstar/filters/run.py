@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from ..backend import jax, jnp
-from ..core import ABSENT, ACCEPTED, Filter, Gate, Info, Measurement, Model, Predicted, pytree
+from ..core import ABSENT, ACCEPTED, RESET, Filter, Gate, Info, Measurement, Model, Predicted, pytree
 
 Array = jax.Array
 
@@ -33,7 +33,7 @@ def step(
     for i, (sensor, m) in enumerate(zip(model.sensors, measurements, strict=True)):
         belief, info = filter.update(belief, sensor, m, gate, refused[i])
         kept = jnp.where(info.status == ABSENT, refused[i], refused[i] + 1)
-        counts.append(jnp.where(info.status == ACCEPTED, 0, kept))
+        counts.append(jnp.where((info.status == ACCEPTED) | (info.status == RESET), 0, kept))
         infos.append(info)
     return belief, jnp.stack(counts) if counts else refused, predicted, tuple(infos)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ..attitude import svd
+from ..attitude import quest, svd
 from ..backend import jax, jnp
 from ..core import ABSENT, ACCEPTED, Gate, Gaussian, Info, Measurement, Predicted, Process, Sensor
 from ..geometry import quaternion, small
-from ..geometry.retraction import Retraction, quaternion_additive, so3_left, so3_right
+from ..geometry.retraction import Retraction, quaternion_additive, so3_left, so3_right, vector_part_left
 
 Array = jax.Array
 
@@ -48,8 +48,11 @@ class StaticSolver:
 def turn_covariance(q_BN: Array, cov_B: Array, retraction: Retraction) -> Array:
     """Covariance of an attitude error on the left in B, turned to the error of an attitude retraction.
 
-    so3_left and gibbs_left: B; so3_right: N; quaternion_additive: the four components, rank 3.
+    so3_left, gibbs_left and mrp_left: B; vector_part_left: half angles in B; so3_right: N; quaternion_additive: the four
+    components, rank 3.
     """
+    if retraction is vector_part_left:
+        return 0.25 * cov_B
     if retraction is so3_right:
         return small.congruence(small.transpose(quaternion.to_matrix(q_BN)), cov_B)
     if retraction is quaternion_additive:
@@ -59,6 +62,6 @@ def turn_covariance(q_BN: Array, cov_B: Array, retraction: Retraction) -> Array:
 
 
 def wahba_start(b: Array, r: Array, sigma: Array, retraction: Retraction, mask: Array | None = None) -> Gaussian:
-    """Belief of an attitude from one epoch of star directions; arguments as for `attitude.svd`."""
-    s = svd(b, r, sigma, mask)
+    """Belief of an attitude from one epoch of star directions; arguments as for `attitude.quest`."""
+    s = quest(b, r, sigma, mask)
     return Gaussian(s.q_BN, turn_covariance(s.q_BN, s.covariance, retraction))

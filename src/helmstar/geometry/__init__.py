@@ -5,16 +5,19 @@ from .retraction import (
     Retraction,
     euclidean,
     gibbs_left,
+    mrp_left,
     product,
     quaternion_additive,
     so3_left,
     so3_right,
+    vector_part_left,
 )
 
 __all__ = [
     "Retraction",
     "euclidean",
     "gibbs_left",
+    "mrp_left",
     "product",
     "quaternion",
     "quaternion_additive",
@@ -22,4 +25,5 @@ __all__ = [
     "so3",
     "so3_left",
     "so3_right",
+    "vector_part_left",
 ]

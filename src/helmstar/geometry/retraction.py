@@ -5,6 +5,8 @@
 | so3_right | q_BN | R_BN = R_hat exp([xi x]) | N (the domain of R_BN) |
 | so3_left | q_BN | R_BN = exp([xi x]) R_hat | B |
 | gibbs_left | q_BN | q_BN = [xi/2, 1] / norm (x) q_hat, xi twice the Gibbs vector | B |
+| mrp_left | q_BN | as gibbs_left, xi four times the modified Rodrigues parameters: no singularity up to a whole turn | B |
+| vector_part_left | q_BN | q_BN = [xi, sqrt(1 - xi^2)] (x) q_hat, xi the vector part, half an angle | B |
 | quaternion_additive | q_BN | q_BN - q_hat; the sum is normalised | none (four numbers) |
 | euclidean(n) | (n,) | x - x_hat | that of x |
 | product(cls, ...) | dataclass | the parts' errors, one after the other | those of the parts |
@@ -13,7 +15,7 @@ Why transport: after an update the mean moves from x to x [+] d and the covarian
 the mean, must follow. For the error on the right the axes of N do not move with the estimate, so nothing changes; on
 the left the axes of B do, and P becomes Exp(d) P Exp(d)^T. With it both sides are the same filter.
 Source: Barrau and Bonnabel, "Intrinsic filtering on SO(3) with discrete-time observations", CDC 2013; Markley,
-"Attitude error representations for Kalman filtering", JGCD 26(2), 2003 (Gibbs vector).
+"Attitude error representations for Kalman filtering", JGCD 26(2), 2003 (Gibbs vector, modified Rodrigues parameters).
 """
 
 from __future__ import annotations
@@ -77,6 +79,50 @@ def _gibbs_transport(d: Array) -> Array:
     return quaternion.to_matrix(quaternion.normalise(jnp.concatenate([0.5 * d, one], axis=-1)))
 
 
+def _mrp_error(d: Array) -> Array:
+    """Unit quaternion of 4 times the modified Rodrigues parameters."""
+    p = 0.25 * d
+    s = jnp.sum(p * p, axis=-1, keepdims=True)
+    return jnp.concatenate([2.0 * p, 1.0 - s], axis=-1) / (1.0 + s)
+
+
+def _mrp_plus(q: Array, d: Array) -> Array:
+    return quaternion.normalise(quaternion.multiply(_mrp_error(d), q))
+
+
+def _mrp_minus(p: Array, q: Array) -> Array:
+    e = quaternion.multiply(p, quaternion.conjugate(q))
+    e = jnp.where(e[..., 3:] < 0.0, -e, e)
+    return 4.0 * e[..., :3] / (1.0 + e[..., 3:])
+
+
+def _mrp_transport(d: Array) -> Array:
+    return quaternion.to_matrix(_mrp_error(d))
+
+
+def _vector_part_error(d: Array) -> Array:
+    """Unit quaternion of a vector part; one longer than 1, which no rotation has, is shortened to it."""
+    square = jnp.sum(d * d, axis=-1, keepdims=True)
+    d = d / jnp.sqrt(jnp.maximum(square, 1.0))
+    # The double where keeps the derivative finite at half a turn.
+    rest = 1.0 - jnp.sum(d * d, axis=-1, keepdims=True)
+    w = jnp.where(rest > 0.0, jnp.sqrt(jnp.where(rest > 0.0, rest, 1.0)), 0.0)
+    return jnp.concatenate([d, w], axis=-1)
+
+
+def _vector_part_plus(q: Array, d: Array) -> Array:
+    return quaternion.normalise(quaternion.multiply(_vector_part_error(d), q))
+
+
+def _vector_part_minus(p: Array, q: Array) -> Array:
+    e = quaternion.multiply(p, quaternion.conjugate(q))
+    return jnp.where(e[..., 3:] < 0.0, -e[..., :3], e[..., :3])
+
+
+def _vector_part_transport(d: Array) -> Array:
+    return quaternion.to_matrix(_vector_part_error(d))
+
+
 def _additive_plus(q: Array, d: Array) -> Array:
     return quaternion.normalise(q + d)
 
@@ -88,6 +134,8 @@ def _additive_minus(p: Array, q: Array) -> Array:
 so3_right = Retraction(_right_plus, _right_minus, None, 3, "so3_right")
 so3_left = Retraction(_left_plus, _left_minus, so3.exp, 3, "so3_left")
 gibbs_left = Retraction(_gibbs_plus, _gibbs_minus, _gibbs_transport, 3, "gibbs_left")
+mrp_left = Retraction(_mrp_plus, _mrp_minus, _mrp_transport, 3, "mrp_left")
+vector_part_left = Retraction(_vector_part_plus, _vector_part_minus, _vector_part_transport, 3, "vector_part_left")
 quaternion_additive = Retraction(_additive_plus, _additive_minus, None, 4, "quaternion_additive")
 
 

@@ -27,7 +27,7 @@ from __future__ import annotations
 from ..backend import jax, jnp
 from ..core import Model, Noise, Process, Sensor, pytree
 from ..geometry import quaternion, small, so3
-from ..geometry.retraction import Retraction, euclidean, product, so3_left
+from ..geometry.retraction import Retraction, euclidean, product, so3_left, so3_right
 from .sensors import star_directions, whole_attitude
 
 Array = jax.Array
@@ -43,10 +43,18 @@ class AttitudeDrift:
 
 @pytree
 class GyroInput:
-    """Gyro over one step: mean rate (3,) in rad/s in B, and additional attitude covariance (3, 3) in rad^2 in B."""
+    """Gyro over one step: mean rate (3,) in rad/s in B, and additional attitude covariance (3, 3) in rad^2 in B.
+
+    `drifts`: 1 where the rate is the gyro's and has its drift, 0 where it comes from elsewhere (a command); None: 1.
+    """
 
     rate: Array
     extra: Array
+    drifts: Array | None = None
+
+
+def _drift_in(u: GyroInput, b: Array) -> Array:
+    return b if u.drifts is None else u.drifts * b
 
 
 @pytree
@@ -71,7 +79,7 @@ def _attitude_jacobian(params: GyroNoise, q: Array, u: GyroInput, dt: Array) -> 
 
 
 def _drift_step(params: GyroNoise, x: AttitudeDrift, u: GyroInput, dt: Array, w: Array) -> AttitudeDrift:
-    turned = quaternion.multiply(quaternion.exp(-(u.rate - x.b) * dt), x.q_BN)
+    turned = quaternion.multiply(quaternion.exp(-(u.rate - _drift_in(u, x.b)) * dt), x.q_BN)
     return AttitudeDrift(quaternion.normalise(quaternion.multiply(quaternion.exp(w[:3]), turned)), x.b + w[3:])
 
 
@@ -82,9 +90,18 @@ def _drift_noise(params: GyroNoise, x: AttitudeDrift, u: GyroInput, dt: Array) -
 
 
 def _drift_jacobian(params: GyroNoise, x: AttitudeDrift, u: GyroInput, dt: Array) -> tuple[Array, None]:
-    phi = -(u.rate - x.b) * dt
+    phi = -(u.rate - _drift_in(u, x.b)) * dt
     o, eye = jnp.zeros((3, 3), phi.dtype), jnp.eye(3, dtype=phi.dtype)
-    return small.blocks([[so3.exp(phi), so3.left_jacobian(phi) * dt], [o, eye]]), None
+    return small.blocks([[so3.exp(phi), _drift_in(u, so3.left_jacobian(phi)) * dt], [o, eye]]), None
+
+
+def _drift_jacobian_right(params: GyroNoise, x: AttitudeDrift, u: GyroInput, dt: Array) -> tuple[Array, Array]:
+    """For the error on the right, in N, which the turn of the body leaves as it is; what happens in B comes in by R_NB."""
+    phi = -(u.rate - _drift_in(u, x.b)) * dt
+    R_NB = small.transpose(small.matmul(so3.exp(phi), quaternion.to_matrix(x.q_BN)))
+    o, eye = jnp.zeros((3, 3), phi.dtype), jnp.eye(3, dtype=phi.dtype)
+    turned = small.matmul(R_NB, _drift_in(u, so3.left_jacobian(phi)) * dt)
+    return small.blocks([[eye, turned], [o, eye]]), small.blocks([[R_NB, o], [o, eye]])
 
 
 def attitude_model(noise: GyroNoise, retraction: Retraction = so3_left, sensors: tuple[Sensor, ...] = ()) -> Model:
@@ -97,7 +114,7 @@ def attitude_drift_model(
     noise: GyroNoise, retraction: Retraction = so3_left, sensors: tuple[Sensor, ...] = ()
 ) -> Model:
     """Attitude and gyro drift (6 states, the state is `AttitudeDrift`); `retraction` is that of the attitude."""
-    jacobian = _drift_jacobian if retraction is so3_left else None
+    jacobian = {so3_left: _drift_jacobian, so3_right: _drift_jacobian_right}.get(retraction)
     whole = product(AttitudeDrift, retraction, euclidean(3))
     return Model(whole, Process(_drift_step, Noise(_drift_noise, 6), noise, jacobian), sensors)
 

@@ -110,7 +110,14 @@ def _unit_left(params: StarNoise, x: Any, r_N: Array) -> Array:
     return _pad(H.reshape(-1, 3), x)
 
 
+def _unit_right(params: StarNoise, x: Any, r_N: Array) -> Array:
+    b = _stars_predict(params, x, r_N)
+    R = quaternion.to_matrix(attitude_of(x))
+    H = -jnp.einsum("nij,nik->njk", tangent_basis(b), so3.hat(b)) @ R
+    return _pad(H.reshape(-1, 3), x)
+
+
 def unit_star_directions(sigma: Array | float, retraction: Retraction = so3_left) -> Sensor:
     """As `star_directions`, for measured directions of unit length: two residuals for each star, across its direction."""
-    jacobian = _unit_left if retraction in (so3_left, gibbs_left) else None
+    jacobian = {so3_left: _unit_left, gibbs_left: _unit_left, so3_right: _unit_right}.get(retraction)
     return Sensor(_stars_predict, _unit_minus, _unit_cov, StarNoise(jnp.asarray(sigma)), jacobian)

@@ -21,7 +21,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Variable:
-    """A recorded quantity: dims after (run, time), dtype on disk and attributes (long_name, units, frame)."""
+    """A recorded quantity: dims after run, dtype on disk and attributes (long_name, units, frame)."""
 
     dims: tuple[str, ...]
     dtype: str
@@ -30,13 +30,18 @@ class Variable:
 
 class Experiment(Protocol):
     """A scenario ready to run. `simulate` is called as function(*arguments, run_ids) for `width` run numbers and returns
-    the data of these runs; an estimator is called as function(*arguments, data) and returns arrays (width, time, ...)."""
+    the data of these runs; an estimator is called as function(*arguments, data) and returns arrays (width, ...) of the
+    variables. time, update (time,): s and number of the measurements that are recorded; steps: how many a run computes;
+    coordinates: of the variables' dims beside time and axis."""
 
     name: str
     title: str
     spec: Any
     width: int
     time: np.ndarray
+    update: np.ndarray
+    steps: int
+    coordinates: Mapping[str, Any]
     simulate: Call
     estimators: Mapping[str, Call]
     variables: Mapping[str, Variable]

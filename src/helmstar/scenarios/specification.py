@@ -117,6 +117,10 @@ def specification_of(experiment: str) -> type[BaseModel]:
         from .xu2020_specification import Specification
 
         return Specification
+    if experiment == "zhou2021":
+        from .zhou2021_specification import Specification
+
+        return Specification
     raise ConfigurationError(f"experiment {experiment!r}: must be one of {', '.join(library())}")
 
 
@@ -124,6 +128,10 @@ def build(name: str, specification: Any) -> Any:
     """The experiment of a specification, ready to run (this loads JAX)."""
     if specification.experiment == "xu2020":
         from .xu2020 import Experiment
+
+        return Experiment(specification, name)
+    if specification.experiment == "zhou2021":
+        from .zhou2021 import Experiment
 
         return Experiment(specification, name)
     raise ConfigurationError(f"experiment {specification.experiment!r}: must be one of {', '.join(library())}")

@@ -7,7 +7,7 @@ Update k = 1.. is the k-th star measurement; errors are taken after it. One more
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -157,16 +157,16 @@ def estimate(model: Model, prior: Prior, stars: Array, data: Data, *, filter: An
 
 VARIABLES = {
     "error_rad": Variable(
-        ("axis",), "f8", {"long_name": "error xi, X = X_hat exp([xi x])", "units": "rad", "frame": "N", "side": "right"}
+        ("time", "axis"), "f8", {"long_name": "error xi, X = X_hat exp([xi x])", "units": "rad", "frame": "N", "side": "right"}
     ),
     "sigma_rad": Variable(
-        ("axis",), "f4", {"long_name": "1 sigma of the error by the filter", "units": "rad", "frame": "N"}
+        ("time", "axis"), "f4", {"long_name": "1 sigma of the error by the filter", "units": "rad", "frame": "N"}
     ),
     "nees": Variable(
-        (), "f4", {"long_name": "normalised estimation error squared, 3 degrees of freedom", "units": "1"}
+        ("time",), "f4", {"long_name": "normalised estimation error squared, 3 degrees of freedom", "units": "1"}
     ),
-    "nis": Variable((), "f4", {"long_name": "normalised innovation squared", "units": "1"}),
-    "nis_dof": Variable((), "i2", {"long_name": "degrees of freedom of nis", "units": "1"}),
+    "nis": Variable(("time",), "f4", {"long_name": "normalised innovation squared", "units": "1"}),
+    "nis_dof": Variable(("time",), "i2", {"long_name": "degrees of freedom of nis", "units": "1"}),
 }
 """What is recorded of every run, update and estimator."""
 
@@ -175,13 +175,16 @@ class Experiment:
     """The scenario ready to run; see `helmstar.scenarios.experiment.Experiment`."""
 
     variables = VARIABLES
+    coordinates: ClassVar[dict[str, Any]] = {}
 
     def __init__(self, spec: Specification, name: str = "xu2020"):
         self.spec = spec
         self.name = name
         self.title = spec.title
         self.width = spec.width
-        self.time = np.arange(1, spec.updates + 1) * spec.step_s
+        self.update = np.arange(1, spec.updates + 1)
+        self.time = self.update * spec.step_s
+        self.steps = spec.updates
         self.star_sigma = spec.star.sigma_arcsec * ARCSEC
         self.gyro_sigma = spec.gyro.sigma_rad_step
         self.truth = truth_of(spec)

@@ -1,0 +1,112 @@
+"""Every key of a zhou2021 scenario and what is allowed. No JAX here: a wrong key is refused at once."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from .specification import ScenarioSpecification
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+ARCSEC = np.pi / 180.0 / 3600.0
+READINGS = {"A": np.sqrt(0.002), "B": 0.002, "C": np.deg2rad(np.sqrt(0.002)), "D": np.deg2rad(0.002)}
+"""Sigma in rad per component of a direction, for each reading of "error covariance 0.002 I"."""
+POLICIES = ("zeros", "hold_last", "hold_mean", "hold_mean_raised", "commanded", "rate_state")
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Orbit(_Table):
+    semi_major_axis_km: Annotated[float, Field(gt=6378.2, allow_inf_nan=False)]
+    eccentricity: Annotated[float, Field(ge=0, lt=1)]
+    inclination_deg: Annotated[float, Field(ge=0, le=180)]
+    raan_deg: Finite
+    argument_of_perigee_deg: Finite
+    mean_anomaly_deg: Finite
+
+    @model_validator(mode="after")
+    def _stays_above(self) -> Orbit:
+        perigee = self.semi_major_axis_km * (1.0 - self.eccentricity)
+        if perigee < 6378.2:
+            raise ValueError(f"perigee {perigee:.1f} km from the Earth's centre: must be above its radius, 6378.2 km")
+        return self
+
+
+class Attitude(_Table):
+    profile: Literal["lvlh", "yaw", "slew", "file"]
+    slew_deg: Annotated[float, Field(ge=0, le=360)]
+    slew_s: Positive
+    slew_every_s: Positive
+    sun: Annotated[list[Finite], Field(min_length=3, max_length=3)]
+    file: str | None = None
+
+    @field_validator("sun")
+    @classmethod
+    def _is_direction(cls, v: list[float]) -> list[float]:
+        norm = float(np.linalg.norm(v))
+        if norm < 1e-9:
+            raise ValueError("must be a direction, not zero")
+        return [x / norm for x in v]
+
+    @model_validator(mode="after")
+    def _complete(self) -> Attitude:
+        if self.profile == "file" and self.file is None:
+            raise ValueError('profile "file" needs the key attitude.file: a CCSDS AEM or an STK .a file')
+        if self.slew_every_s < self.slew_s:
+            raise ValueError(f"slew_every_s = {self.slew_every_s}: must not be shorter than slew_s = {self.slew_s}")
+        return self
+
+
+class Star(_Table):
+    geometry: Literal["wide", "fov"]
+    field_deg: Annotated[float, Field(gt=0, le=120)]
+    faintest: Annotated[float, Field(ge=2, le=9)]
+    reading: Literal["A", "B", "C", "D"]
+    sigma_arcsec: Positive | None = None
+    loss_start_s: NonNegative
+    loss_s: NonNegative
+
+    @property
+    def sigma(self) -> float:
+        """Sigma in rad per component of a direction."""
+        return READINGS[self.reading] if self.sigma_arcsec is None else self.sigma_arcsec * ARCSEC
+
+
+class Gyro(_Table):
+    arw_deg_sqrt_h: Positive
+    rrw_deg_h_sqrt_h: NonNegative
+    initial_drift_sigma_deg_h: Positive
+    loss_start_s: NonNegative
+    loss_s: Positive
+    loss_policy: Literal["none", "zeros", "hold_last", "hold_mean", "hold_mean_raised", "commanded", "rate_state"]
+    hold_s: Annotated[float, Field(ge=1, allow_inf_nan=False)]
+    raised_deg_s: Positive
+    command_error: Annotated[float, Field(gt=-1, lt=1)]
+
+
+class Tuning(_Table):
+    wrong_start_sigma_deg: Positive
+    reset_probability: Annotated[float, Field(gt=0, lt=1)]
+    reset_after: Annotated[int, Field(ge=1)]
+    reset_drift_sigma_deg_h: Positive
+    adaptive_share: Annotated[float, Field(gt=0, lt=1)]
+    rate_sigma_deg_s: Positive
+    recovered_deg: Positive
+
+
+class Specification(ScenarioSpecification):
+    """Every key of a zhou2021 scenario."""
+
+    experiment: Literal["zhou2021"]
+    duration_s: Annotated[int, Field(ge=60, le=1_000_000)]
+    orbit: Orbit
+    attitude: Attitude
+    star: Star
+    gyro: Gyro
+    tuning: Tuning
