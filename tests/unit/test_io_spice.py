@@ -18,6 +18,7 @@ from helmstar.io.settings import FormatSettings, SpiceConfiguration
 from helmstar.io.spice_ck import CkSegment, write_ck
 from helmstar.io.spice_kernels import instants_from_tdb, leap_second_kernel, loaded
 from helmstar.io.telemetry import read_telemetry
+from helmstar.telemetry.export import check_export
 
 relaxed = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 ORIGIN = Origin(8035, 37.25, absolute=True)  # 2021-12-31T00:00:00.25 UTC
@@ -189,6 +190,8 @@ def test_without_spiceypy_the_remedy_is_said(monkeypatch, tmp_path):
         read(tmp_path / "x.bc")
     with pytest.raises(DataError, match=r'pip install "helmstar\[spice\]"'):
         write_ck(tmp_path / "y.bc", ORIGIN, [])
+    with pytest.raises(DataError, match=r'pip install "helmstar\[spice\]"'):  # --ck says so before the work
+        check_export(ORIGIN, aem=False, ck=True)
 
 
 def pointing_to(name, error):

@@ -43,6 +43,7 @@ DOCUMENTED: dict[str, list[str]] = {
     "IMU1A": [*_TIME, "time_ref", "GRACEFO_id", "gyro_id", "FiltAng", "qualflg"],
     "IMU1B": [*_TIME, "time_ref", "GRACEFO_id", "gyro_id", "FiltAng", "qualflg"],
 }  # fmt: skip
+_BIT = re.compile(r"\bbit\s*(\d{1,2})\s*[=:]\s*(.*?)(?=[,;]?\s*\bbit\s*\d{1,2}\s*[=:]|$)", re.IGNORECASE)
 _NOT_BELIEVED = re.compile(
     r"invalid|not valid|bad|missing|gap|fill|interpolat|extrapolat|outlier|no data|suspect", re.I
 )
@@ -127,8 +128,9 @@ def _variables(header: list[str]) -> tuple[list[str], dict[str, str], dict[int, 
             names.append(found[1])
         elif names and (found := re.match(r"^units?\s*:\s*(.+)$", text)):
             units[names[-1]] = found[1].strip().strip("'\"")
-        elif names and names[-1] == "qualflg" and (found := re.search(r"bit\s*(\d+)\s*=\s*(.*)$", text, re.I)):
-            flags[int(found[1])] = found[2].strip().strip("'\"")
+        elif names and names[-1] == "qualflg":
+            for found in _BIT.finditer(text):
+                flags[int(found[1])] = found[2].strip(" ,;'\"")
     return names, units, flags
 
 
@@ -208,11 +210,11 @@ def unflagged(product: Product, settings: GraceFoConfiguration, log: ProblemLog)
     table = product.table
     if "qualflg" not in table.columns:
         return np.ones(len(table), dtype=bool)
-    texts = table.texts("qualflg")
-    values, index = np.unique(np.array(texts.to_pylist(), dtype=str), return_inverse=True)
+    encoded = table.texts("qualflg").combine_chunks().dictionary_encode()
+    values, index = encoded.dictionary.to_pylist(), encoded.indices.to_numpy()
     reject, mark = np.zeros(len(values), dtype=bool), np.zeros(len(values), dtype=bool)
     meaning = []
-    for i, text in enumerate(values.tolist()):
+    for i, text in enumerate(values):
         is_binary = bool(text) and set(text) <= {"0", "1"} and len(text) <= 64
         bits = [bit for bit, digit in enumerate(reversed(text)) if digit == "1"] if is_binary else []
         against = [bit for bit in bits if _speaks_against(bit, product, settings)]
@@ -220,7 +222,8 @@ def unflagged(product: Product, settings: GraceFoConfiguration, log: ProblemLog)
         said = "; ".join(
             f"bit {bit}: {product.flags.get(bit, 'not explained in the header')}" for bit in against or bits
         )
-        meaning.append(f"qualflg {text[:64]!r} ({said or 'no row of bits'})")
+        choice = "; [gracefo] reject_bits chooses" if reject[i] and is_binary else ""
+        meaning.append(f"qualflg {text[:64]!r} ({said or 'no row of bits'}){choice}")
     for chosen, action in ((reject, "dropped"), (mark & ~reject, "used")):
         which = np.flatnonzero(chosen[index])
         kinds = index[which]
