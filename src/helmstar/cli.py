@@ -256,6 +256,8 @@ def _attitude(args: argparse.Namespace) -> int:
         from .report.terminal import print_attitude
 
         print_attitude(result)
+        for name, file in result.get("exports", {}).items():
+            print(f"{name}: {Path(file).resolve()}")
         print(f"report: {report.resolve()}")
     return 0
 

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from telemetry_simulator import ARCSEC
 
 from helmstar.cli import main
-from helmstar.errors import DataError, HelmstarError
+from helmstar.errors import ConfigurationError, DataError, HelmstarError
 from helmstar.io.settings import FormatSettings, GraceFoConfiguration
 from helmstar.io.telemetry import read_telemetry
+from helmstar.sensors.configuration import load_sensors
 
 relaxed = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -227,6 +228,25 @@ def test_garbage_is_a_data_error_with_its_file(tmp_path, content, message):
     with pytest.raises(DataError, match=message) as caught:
         read(path)
     assert path.name in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("toml", "message"),
+    [
+        ("[gracefo]\nimu_axes = [[1, 0, 0], [0, 2, 0]]", r"gracefo\.imu_axes: .*length 2, but an axis needs 1"),
+        ("[gracefo]\nmounting.one = [1, 0, 0, 0]", r"gracefo\.mounting: 'one' is no sca_id"),
+        ("[gracefo]\nmounting.1 = [1, 1, 0, 0]", r"length 1\.41421, but a rotation needs 1"),
+        ("[gracefo]\nreject_bits = [-1]", r"-1 is no bit of qualflg"),
+        ("[gracefo]\nquaternion_sens = 'bn'", r"unknown key 'gracefo\.quaternion_sens'.*quaternion_sense"),
+        ("[spice]\nframe = 'MY BODY'", r"spice\.frame: 'MY BODY' is no name of a SPICE frame"),
+        ("[spice]\nspacecraft_id = 5", r"spice\.spacecraft_id = 5 is not allowed"),
+        ("[aem]\nobject_name = ''", r"aem\.object_name: '' is no value of a message"),
+    ],
+)
+def test_settings_are_checked_with_their_keys(tmp_path, toml, message):
+    (tmp_path / "s.toml").write_text(toml)
+    with pytest.raises(ConfigurationError, match=message):
+        load_sensors(tmp_path / "s.toml")
 
 
 @relaxed

@@ -167,6 +167,19 @@ def test_stored_instants_of_another_frame_are_turned(spice, written, tmp_path):
     np.testing.assert_allclose(error, 0.0, atol=1e-12)
 
 
+def test_a_kernel_of_the_other_byte_order_is_read(written, tmp_path):
+    content = written[1][0].read_bytes()
+    record = 1024 * (int.from_bytes(content[76:80], "little") - 1)
+    swapped = bytearray(np.frombuffer(content, "<f8").astype(">f8").tobytes())
+    swapped[:1024] = content[:1024]
+    for place in (8, 12, 76, 80, 84, *range(record + 40, record + 64, 4)):
+        swapped[place : place + 4] = content[place : place + 4][::-1]
+    swapped[88:96] = b"BIG-IEEE"
+    (tmp_path / "big.bc").write_bytes(swapped)
+    other = read(tmp_path / "big.bc", kernels=[str(written[1][1])])
+    np.testing.assert_array_equal(other.attitude.q_BN, read(written[1][0], kernels=["attitude.tsc"]).attitude.q_BN)
+
+
 def test_errors_say_what_to_give(written, tmp_path):
     _, files = written
     with pytest.raises(DataError, match=r"attitude\.bc: SPICE says.*\[spice\] kernels"):
