@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pandas as pd
 import xarray as xr
@@ -63,6 +65,8 @@ def campaign(names=ALL, runs=100, times=1000, requested=None, spoil=False):
             "scenario": "xu2020", "title": "Xu, Pei, Jiang (2020): attitude from two stars", "seed": 0, "runs": runs,
             "requested_runs": requested or runs, "command": "helmstar run xu2020 --runs 100 --seed 0",
             "configuration": "[star]\nsigma_arcsec = 20 # </script> & \"quoted\"\n", "wall_s": 12.5,
+            "pooled_text": "updates 200 to 600", "pooled_updates": [min(200, times), min(600, times)],
+            "references": json.dumps({n: "lie_tuned" if n.endswith("_tuned") else "lie" for n in ALL}),
             "versions": '{"python": "3.11.2", "jax": "0.10.2"}', "helmstar_version": "0.1.0",
         },
     )  # fmt: skip

@@ -115,6 +115,38 @@ def test_headline_names_what_converges_and_what_does_not():
     assert more == "No run of `lie_printed` settles below 1 deg."
 
 
+def test_paired_comparison_is_of_the_same_runs_and_tuning():
+    dataset, summary = samples.campaign(["lie", "lie_left", "lie_tuned", "mekf_tuned", "static_svd"], 12, 700)
+    shape = dataset["error_rad"].shape[1:]
+    shared = np.random.default_rng(3).standard_normal(shape) * (1.0 + np.arange(shape[0]))[:, None, None]
+    arcsec = np.pi / 180 / 3600
+    # One draw for all; a reference with the RMS of the draw, and rivals 2 percent above it or the same to rounding.
+    for name, factor in {
+        "lie": 1.0,
+        "lie_left": 1.0 + 1e-9,
+        "lie_tuned": 0.5,
+        "mekf_tuned": 0.4,
+        "static_svd": 1.02,
+    }.items():
+        dataset["error_rad"].loc[{"estimator": name}] = factor * arcsec * shared
+    page = monte_carlo_page(dataset, summary, [])
+    table = page.html().split("Paired comparison</h3>")[1]
+    rows = table[table.index("<tbody") : table.index("</tbody>")].split("</tr>")[:-1]
+    cells = [[re.sub(r"<[^>]+>", "", cell) for cell in re.split("</t[hd]>", row)] for row in rows]
+    d = 0.02 * np.sqrt(np.mean(np.sum(shared[:, 199:600] ** 2, axis=-1), axis=1))
+    figures = [f"{d.mean():.3g}", f"{d.std(ddof=1) / np.sqrt(12):.3g}"]
+    assert [row[0] for row in cells] == ["lie_left", "mekf_tuned", "static_svd"]
+    assert cells[0][5].endswith("same to rounding")
+    assert (cells[1][1], cells[1][4], cells[1][5][2:]) == ("lie_tuned", "12/12", "better")
+    assert (cells[2][1], *cells[2][2:5], cells[2][5][2:]) == ("lie", *figures, "0/12", "worse")
+    assert page.html().count("updates 200 to 600") == 2
+
+
+def test_nothing_to_compare_is_no_table():
+    for names, runs in ((["lie"], 4), (["lie", "mekf"], 1), (["mekf", "lie_tuned"], 3)):
+        assert "Paired comparison" not in monte_carlo_page(*samples.campaign(names, runs, 30), []).html()
+
+
 def test_report_imports_neither_jax_nor_plotly_nor_scipy_stats():
     import subprocess
 

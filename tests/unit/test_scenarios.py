@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+import xarray as xr
 
 from helmstar.errors import ConfigurationError
+from helmstar.report.claims import Claim
 from helmstar.scenarios import library, load, parse_set
+from helmstar.scenarios.xu2020_results import claims, departures
 
 
 def test_the_library_is_valid():
@@ -88,3 +92,88 @@ def test_a_wrong_file_is_explained(tmp_path, content, words):
 def test_an_unknown_scenario_lists_those_there_are():
     with pytest.raises(ConfigurationError, match="there are xu2020"):
         load("xu2021")
+
+
+# --- the claims of xu2020 --------------------------------------------------------------------------------------------
+
+
+def figures(good: bool, runs: int = 4, ratio: float | None = 1.0, mark: str = "150") -> dict:
+    """Metrics of an estimator of which all runs, or none, converge."""
+    by = {"runs": runs if good else 0, "by": 40 if good else None}
+    return {
+        "rms_deg": {mark: [0.002 if good else 30.0] * 3},
+        "median_error_deg": {mark: 0.002},
+        "converged": {"1deg": by, "0.1deg": by},
+        "diverged": 0 if good else runs,
+        "nees_mean": 3.0 if good else 1e-6,
+        "rms_over_bound": [ratio] * 3,
+        "us_per_step": 1.0,
+    }
+
+
+def judged(estimators: dict, updates: int = 150, **overrides) -> dict[str, Claim]:
+    spec = load("xu2020", {k.replace("__", "."): v for k, v in overrides.items()})[1]
+    dataset = xr.Dataset({"bound_rad": (("time", "axis"), np.full((updates, 3), 1e-5))})
+    found = claims(spec, dataset, {"runs": 4, "estimators": estimators})
+    return dict(zip(("accuracy", "convergence", "quaternion", "static", "noise"), found, strict=True))
+
+
+def every_claim(lie=True, printed=False, **more) -> dict:
+    names = {"lie_printed": figures(printed), "lie": figures(lie), "quaternion_ekf": figures(True)}
+    return names | {"static_svd": figures(True, ratio=3.0)} | more
+
+
+def test_claims_are_judged_by_the_figures():
+    usual = judged(every_claim())
+    assert [c.verdict for c in usual.values()] == [
+        "holds in part",
+        "holds in part",
+        "does not hold",
+        "holds",
+        "measured",
+    ]
+    assert (
+        "none of 4 runs with the printed equations; every run with the consistent form" in usual["accuracy"].explanation
+    )
+    other = judged(
+        every_claim(lie=False, printed=True, quaternion_ekf=figures(False), static_svd=figures(True, ratio=0.5))
+    )
+    expected = ["holds in part", "holds in part", "holds", "does not hold", "does not hold"]
+    assert [c.verdict for c in other.values()] == expected
+    assert (
+        "every run with the printed equations; none of 4 runs with the consistent form" in other["accuracy"].explanation
+    )
+    assert "every run diverged" in other["quaternion"].explanation
+    assert "carries information" not in other["static"].explanation
+    assert judged(every_claim(printed=True))["accuracy"].verdict == "holds"
+    assert judged(every_claim(lie=False))["convergence"].verdict == "does not hold"
+
+
+@pytest.mark.parametrize(
+    ("changed", "spared"),
+    [
+        ({"start__error_deg": 10}, set()),
+        ({"star__directions": [[0, 0, 1], [0, 1, 0]]}, set()),
+        ({"truth__rate_amplitude_rad_s": 1e-3}, set()),
+        ({"tuning__q_w": 1e-3}, {"quaternion"}),
+        ({"tuning__quaternion_p0": 2}, {"accuracy", "convergence", "static", "noise"}),
+    ],
+)
+def test_another_experiment_than_the_papers_is_measured_only(changed, spared):
+    (key,) = changed
+    for name, claim in judged(every_claim(lie=False), **changed).items():
+        assert (key.replace("__", ".") in claim.explanation) == (name not in spared)
+        assert name in spared or claim.verdict == "measured"
+
+
+def test_what_the_paper_does_not_state_may_change():
+    assert departures(load("xu2020", {"star.sigma_arcsec": 5, "gyro.sigma_rad_step": 1e-6, "runs": 2})[1]) == []
+    same = {"star.directions": [[3, 0, 0], [0, 2, 0]], "truth.rate": "euler"}
+    assert departures(load("xu2020", same)[1]) == []
+
+
+def test_a_short_campaign_judges_nothing_and_a_missing_figure_does_not_stop_it():
+    short = {n: m | {"rms_deg": {"20": [None] * 3}} for n, m in every_claim(lie=False).items()}
+    assert {c.verdict for c in judged(short, updates=20).values()} == {"measured"}
+    gone = figures(True) | {"rms_over_bound": [3.0, None, 3.0], "nees_mean": None}
+    assert judged(every_claim(static_svd=gone))["static"].verdict == "holds"

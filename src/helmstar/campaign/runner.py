@@ -127,6 +127,7 @@ def run_campaign(
         "configuration": configuration,
         "versions": json.dumps(versions()),
         "helmstar_version": __version__,
+        **experiment.attributes(),
     }
     metrics = experiment.summarise(dataset)
     wall = time.perf_counter() - begin

@@ -15,9 +15,6 @@ NEES_DEGREES = 3  # three attitude errors are scored for every estimator, whatev
 
 def headline(campaign: Campaign) -> tuple[str, ...]:
     """The result in one sentence, then what to know besides."""
-    written = campaign.summary.get("headline")
-    if written:
-        return (str(written),)
     if not campaign.runs:
         return ("No run is finished yet.",)
     names, runs = campaign.names, campaign.runs
@@ -134,10 +131,9 @@ def _last_key(campaign: Campaign) -> str:
 
 
 def _window(campaign: Campaign) -> str:
-    window = campaign.summary.get("window") or campaign.attrs.get("pooled_updates")
-    text = f" over updates {window[0]} to {window[1]}" if window is not None and len(window) == 2 else ""
+    over = campaign.attrs.get("pooled_text", "steady-state updates")
     return (
-        f"RMS / bound and NEES are pooled over runs and steady-state updates{text}. A run counts as below a limit "
+        f"RMS / bound and NEES are pooled over runs and {over}. A run counts as below a limit "
         "from the update on after which it never exceeds it again."
     )
 

@@ -20,6 +20,7 @@ from .campaign_data import Campaign
 from .campaign_table import add_summary_table, headline
 from .claims import Claim, add_claims
 from .page import Column, Page
+from .paired import add_paired
 
 if TYPE_CHECKING:
     import xarray
@@ -56,6 +57,7 @@ def monte_carlo_page(dataset: xarray.Dataset, summary: dict[str, Any], claims: S
         add_claims(page, claims)
     page.section("Summary of all estimators", short="Summary")
     add_summary_table(page, campaign)
+    add_paired(page, campaign)
     if campaign.runs:
         parts.add_paper_figures(page, campaign)
         parts.add_convergence(page, campaign)

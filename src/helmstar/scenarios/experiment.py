@@ -50,6 +50,12 @@ class Experiment(Protocol):
         """Variables that do not depend on run and estimator (truth, bound): name -> (dims, values, attrs)."""
         ...
 
+    def attributes(self) -> dict[str, Any]:
+        """Of the dataset, for the report: `experiment`, `nees_dof` (degrees of freedom of `nees`), `pooled_text` (over what
+        the metrics are pooled). For a paired comparison also `pooled_updates` (first and last, of a run's score) and
+        `references` (JSON, estimator -> the one it is compared with)."""
+        ...
+
     def summarise(self, dataset: Any) -> dict[str, dict]:
         """Metrics of each estimator, of finite numbers and None."""
         ...

@@ -6,6 +6,7 @@ Update k = 1.. is the k-th star measurement; errors are taken after it. One more
 
 from __future__ import annotations
 
+import json
 from functools import partial
 from typing import Any, ClassVar
 
@@ -25,10 +26,11 @@ from ..filters import (
     scaled,
 )
 from ..filters.static import turn_covariance
-from ..geometry import quaternion, so3, so3_left, so3_right
+from ..geometry import quaternion, small, so3, so3_left, so3_right
 from ..geometry.retraction import Retraction, gibbs_left, quaternion_additive
 from ..models import rigid_body, xu2020
 from .experiment import Call, Variable
+from .xu2020_results import WINDOW
 from .xu2020_specification import Specification
 
 Array = jax.Array
@@ -124,8 +126,6 @@ def error_in_N(retraction: Retraction, truth: Array, belief: Any) -> tuple[Array
         R = quaternion.to_matrix(q)
         P_N = P if retraction is so3_right else R.T @ P @ R
     # Solved without a LAPACK call; a covariance that is not positive gives NaN, which is what is recorded.
-    from ..geometry import small
-
     white = small.matvec(small.invert_lower(small.cholesky(P)), own)
     return xi, jnp.sqrt(jnp.diagonal(P_N)), jnp.sum(white**2)
 
@@ -157,7 +157,9 @@ def estimate(model: Model, prior: Prior, stars: Array, data: Data, *, filter: An
 
 VARIABLES = {
     "error_rad": Variable(
-        ("time", "axis"), "f8", {"long_name": "error xi, X = X_hat exp([xi x])", "units": "rad", "frame": "N", "side": "right"}
+        ("time", "axis"),
+        "f8",
+        {"long_name": "error xi, X = X_hat exp([xi x])", "units": "rad", "frame": "N", "side": "right"},
     ),
     "sigma_rad": Variable(
         ("time", "axis"), "f4", {"long_name": "1 sigma of the error by the filter", "units": "rad", "frame": "N"}
@@ -262,6 +264,17 @@ class Experiment:
             ),
         }
 
+    def attributes(self) -> dict[str, Any]:
+        """Of the dataset: what the report must know."""
+        references = {n: "lie_tuned" if n.endswith("_tuned") else "lie" for n in self.estimators}
+        return {
+            "experiment": "xu2020",
+            "nees_dof": 3,
+            "pooled_text": f"updates {WINDOW[0]} to {WINDOW[1]}",
+            "pooled_updates": list(WINDOW),
+            "references": json.dumps(references),
+        }
+
     def summarise(self, dataset: Any) -> dict[str, dict]:
         """The metrics of `helmstar run xu2020 --json`."""
         from .xu2020_results import summarise
@@ -269,10 +282,10 @@ class Experiment:
         return summarise(dataset)
 
     def claims(self, dataset: Any, summary: dict) -> list:
-        """The paper's claims, judged."""
+        """The paper's claims, judged where this is the paper's experiment."""
         from .xu2020_results import claims
 
-        return claims(dataset, summary)
+        return claims(self.spec, dataset, summary)
 
 
 def truth_of(spec: Specification) -> rigid_body.RigidBodyTruth:
