@@ -140,6 +140,14 @@ def test_without_a_list_of_variables_the_documented_layout_holds(tmp_path):
     path = tmp_path / "SCA1B_2022-01-01_C_04.txt"
     path.write_text("header:\n  global_attributes:\n    title: GRACE-FO\n# End of YAML header\n" + FLIGHT)
     assert len(read(path).attitude) == 4
+    imu = tmp_path / "IMU1B_2022-01-01_C_04.txt"
+    rows = [r.split() for r in files.imu_rows(2.0, np.zeros(3))]
+    long = "\n".join(" ".join(r) for r in rows)
+    short = "\n".join(f"{int(r[0]) + 1e-6 * int(r[1]):.6f} C {r[4]} {r[5]} {r[6]}" for r in rows)
+    imu.write_text(f"header:\n# End of YAML header\n{long}\n")
+    by_parts = read(imu).gyro
+    imu.write_text(f"header:\n# End of YAML header\n{short}\n")
+    np.testing.assert_allclose(read(imu).gyro.value, by_parts.value, atol=1e-9)  # seconds of 9 digits hold 1e-7 s
     nameless = path.rename(tmp_path / "x.txt")
     with pytest.raises(DataError, match=r"x\.txt: the header has no list of variables"):
         read(nameless)
@@ -151,12 +159,13 @@ def test_bad_rows_are_named_by_their_line(tmp_path):
     rows[3] = rows[3].rsplit(" ", 1)[0]
     rows[5] = rows[5].replace(" 0.8 ", " 0.9 ")
     rows[7] = "x" + rows[7]
+    rows[0] = "0 C 1 1.0 00000000"  # as wide as another layout
     rows[9] = rows[9].replace(f"{files.GPS_START + 9:.0f}", f"{files.GPS_START - 99:.0f}")
     path = files.write(tmp_path / "SCA1B_x_C_04.txt", "SCA1B", rows)
     first = path.read_text().splitlines().index("# End of YAML header") + 2
     telemetry = read(path)
     found = {p.row - first: p.kind for p in telemetry.problems}
-    expected = {2: "not_a_number", 3: "ragged", 5: "non_unit", 7: "time_unreadable", 9: "time_backwards"}
+    expected = {0: "ragged", 2: "not_a_number", 3: "ragged", 5: "non_unit", 7: "time_unreadable", 9: "time_backwards"}
     assert found == expected
     assert all(p.file == str(path) and p.action == "dropped" for p in telemetry.problems)
     assert telemetry.attitude.row.tolist() == [first + i for i in range(12) if i not in expected]
@@ -209,6 +218,10 @@ def test_star_cameras_of_sca1a_are_turned_into_the_science_frame(tmp_path):
     np.testing.assert_allclose(difference, 0.0, atol=1e-12)
     assert telemetry.origin.utc([0.0])[0].endswith("23:59:42.250000")
     assert {(p.kind, p.action) for p in telemetry.problems} == {("unused", "not used"), ("flagged", "dropped")}
+    own = read(path, sca_id=1)
+    camera = Rotation.from_quat(own.attitude.q_BN) * (R_camera_B * R_BN[kept]).inv()
+    np.testing.assert_allclose(camera.magnitude(), 0.0, atol=1e-12)
+    assert ("frame", "used") in {(p.kind, p.action) for p in own.problems}
 
 
 @pytest.mark.parametrize(

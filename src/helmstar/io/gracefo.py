@@ -36,12 +36,13 @@ END_OF_HEADER = b"# End of YAML header"
 _NAME = re.compile(r"^(SCA1A|SCA1B|IMU1A|IMU1B)_.*\.(txt|dat|asc)(\.gz)?$", re.IGNORECASE)
 _TIME = ["rcvtime_intg", "rcvtime_frac"]
 _QUATERNION = ["quatangle", "quaticoeff", "quatjcoeff", "quatkcoeff"]
-DOCUMENTED: dict[str, list[str]] = {
-    "SCA1A": [*_TIME, "GRACEFO_id", "sca_id", "sca_desig", *_QUATERNION, "nlocks", "nstars", "sca_confid", "sca_null1",
-              "sca_null2", "sca_mode", "qualflg"],
-    "SCA1B": ["gps_time", "GRACEFO_id", "sca_id", *_QUATERNION, "qual_rss", "qualflg"],
-    "IMU1A": [*_TIME, "time_ref", "GRACEFO_id", "gyro_id", "FiltAng", "qualflg"],
-    "IMU1B": [*_TIME, "time_ref", "GRACEFO_id", "gyro_id", "FiltAng", "qualflg"],
+_IMU = [*_TIME, "time_ref", "GRACEFO_id", "gyro_id", "FiltAng", "qualflg"]
+DOCUMENTED: dict[str, list[list[str]]] = {  # where the header does not say; several are told apart by their width
+    "SCA1A": [[*_TIME, "GRACEFO_id", "sca_id", "sca_desig", *_QUATERNION, "nlocks", "nstars", "sca_confid", "sca_null1",
+               "sca_null2", "sca_mode", "qualflg"]],
+    "SCA1B": [["gps_time", "GRACEFO_id", "sca_id", *_QUATERNION, "qual_rss", "qualflg"]],
+    "IMU1A": [_IMU],
+    "IMU1B": [_IMU, ["gps_time", "GRACEFO_id", "gyro_id", "FiltAng", "qualflg"]],
 }  # fmt: skip
 _BIT = re.compile(r"\bbit\s*(\d{1,2})\s*[=:]\s*(.*?)(?=[,;]?\s*\bbit\s*\d{1,2}\s*[=:]|$)", re.IGNORECASE)
 _NOT_BELIEVED = re.compile(
@@ -93,13 +94,16 @@ def read_product(path: Path, log: ProblemLog) -> Product:
     header = head.decode("utf-8", "replace").splitlines()
     names, units, flags = _variables(header)
     named = re.search(r"(SCA1A|SCA1B|IMU1A|IMU1B)", path.name.upper())
-    documented = DOCUMENTED[named[1]] if named else []
     body = body.partition(b"\n")[2]
     first = head.count(b"\n") + 2
     body = _tidy(body)
-    width = len(body.split(b"\n", 1)[0].split())
-    if not names or (len(names) != width and len(documented) == width):
-        names = documented
+    widths = {len(line.split()) for line in body[:8192].split(b"\n")[:-1] or [body]}  # the last line may be cut
+    layouts = DOCUMENTED[named[1]] if named else []
+    fitting = [layout for layout in layouts if len(layout) in widths]
+    if len(names) not in widths and fitting:
+        names = fitting[0]
+    elif not names and layouts:
+        names = layouts[0]
     if not names:
         raise DataError(
             f"{file}: the header has no list of variables, and the name does not say the product; call the file as it "
@@ -275,11 +279,17 @@ def _one_camera(
     if settings.sca_id is not None and settings.sca_id not in present:
         raise DataError(f"{table.file}: no usable row of sca_id {settings.sca_id}; there are {listed}")
     used = settings.sca_id if settings.sca_id is not None else next(iter(known), None)
-    if used is None or used not in known:
+    if used is None:
         raise DataError(
             f"{table.file}: SCA1A holds attitudes of star cameras (sca_id {listed}) in their own frames; say how they sit "
             "in the science reference frame by the four numbers of QSA1B, in sensors.toml: [gracefo] "
-            "mounting.1 = [cos, i, j, k]"
+            "mounting.1 = [cos, i, j, k] (or sca_id = 1 alone, to have that camera's frame as B)"
+        )
+    w, x, y, z = settings.mounting.get(str(used), (1.0, 0.0, 0.0, 0.0))
+    if used not in known:
+        first = np.flatnonzero(stays & (camera == used))[:1]
+        log.add(
+            table.file, table.row[first], "frame", f"B is the frame of camera {used}, for it has no mounting", "used"
         )
     others = stays & (camera != used)
     log.add(table.file, table.row[others], "unused", f"another star camera than sca_id {used}", "not used")
@@ -290,7 +300,6 @@ def _one_camera(
         message = f"sca_confid is not below {settings.confidence_below}"
         log.add(table.file, table.row[poor], "flagged", message, "dropped")
         stays &= ~poor
-    w, x, y, z = settings.mounting[str(used)]
     return stays, np.array([x, y, z, w])
 
 
