@@ -60,7 +60,7 @@ def solve_files(files: list[Path], toml: str | None = None, strict: bool = False
         config = files[0].parent / "sensors.toml"
         config.write_text(toml)
     sensors = load_sensors(config)
-    telemetry = read_telemetry(files, sensors.columns or None, strict=strict)
+    telemetry = read_telemetry(files, sensors.columns or None, strict=strict, offsets=sensors.time_offsets)
     solution = solve(telemetry, sensors, strict)
     result = result_of(solution, telemetry, files, "helmstar attitude")
     json.dumps(result, allow_nan=False)

@@ -33,6 +33,16 @@ KEYS = st.sampled_from(
     ]
 )  # fmt: skip
 
+EXTREMES = [  # the ends of what is allowed
+    "[gyro]\narw_rad_sqrt_s = 10\nrrw_rad_s_sqrt_s = 10\n[star]\nsigma_arcsec = 648000",
+    "[gyro]\narw_rad_sqrt_s = 1e-15\nrrw_rad_s_sqrt_s = 1e-15\n[star]\nsigma_arcsec = 1e-6",
+    "[gyro]\narw_rad_sqrt_s = 0\nrrw_rad_s_sqrt_s = 0\n[star]\nsigma_arcsec = 1e-6",
+    "[star]\nsigma_cross_arcsec = 0.648\nsigma_roll_arcsec = 648000\nq_sb = [0.5, 0.5, 0.5, 0.5]",
+    "[gyro]\ninitial_drift_sigma_arcsec_s = 2e8", "[gyro]\ninitial_drift_sigma_arcsec_s = 1e-9",
+    "[filter]\nreopen_after = 1000000", "[filter]\nreopen_after = 99999999999999999999",
+    "[gyro]\nreading = 'increment_rad'",
+]  # fmt: skip
+
 
 def table(star: bool) -> list[list[str]]:
     """Cells of a good table: a slow turn, an attitude or one star in each row."""
@@ -117,6 +127,32 @@ def test_damaged_tables_and_odd_configurations(tmp_path, star, cells, columns, r
             good[row] = good[row][:3]
     files = {"t.csv": join(header, good), "sensors.toml": "\n".join(keys).encode()}
     ends_well(*run(tmp_path, files, *(["--strict"] if strict else [])))
+
+
+@settings(relaxed, max_examples=30)
+@given(
+    jump_s=st.sampled_from([0.0, 1e4, 1e8, 1e14]),
+    step_s=st.sampled_from([1.0, 1e-7, 2.0 * np.pi * 20, 1e6, 1e13]),
+    rate=st.sampled_from([0.0, 1e-3, 0.05, 10.0, 900.0, 1e11]),
+    pattern=st.sampled_from(["constant", "alternating", "random"]),
+    attitude=st.sampled_from(["still", "random"]),
+    keys=st.sampled_from(["", *EXTREMES]),
+)
+@example(jump_s=1e8, step_s=1.0, rate=1e-5, pattern="random", attitude="still", keys="")
+@example(jump_s=0.0, step_s=1.0, rate=900.0, pattern="alternating", attitude="still", keys="")
+@example(jump_s=0.0, step_s=1.0, rate=900.0, pattern="random", attitude="still", keys="")
+@example(jump_s=0.0, step_s=2.0 * np.pi * 20, rate=0.05, pattern="constant", attitude="still", keys="")
+@example(jump_s=0.0, step_s=1.0, rate=1e11, pattern="constant", attitude="still", keys="")
+@example(jump_s=0.0, step_s=1e13, rate=1e-5, pattern="random", attitude="random", keys=EXTREMES[0])
+def test_clocks_rates_and_attitudes_that_no_body_has(tmp_path, jump_s, step_s, rate, pattern, attitude, keys):
+    rng = np.random.default_rng(3)
+    time = step_s * np.arange(ROWS) + np.where(np.arange(ROWS) > ROWS // 2, jump_s, 0.0)
+    one = {"constant": 1.0, "alternating": (-1.0) ** np.arange(ROWS), "random": rng.normal(size=ROWS)}[pattern]
+    rates = np.column_stack([rate * one * np.ones(ROWS), 1e-6 * rng.normal(size=(ROWS, 2))])
+    spread = np.pi if attitude == "random" else 1e-5
+    q = Rotation.from_rotvec(spread * rng.normal(size=(ROWS, 3))).as_quat()
+    rows = [[f"{v:.17g}" for v in row] for row in np.column_stack([time, rates, q])]
+    ends_well(*run(tmp_path, {"t.csv": join(HEADER, rows), "sensors.toml": keys.encode()}))
 
 
 @settings(relaxed, max_examples=25)

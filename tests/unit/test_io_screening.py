@@ -162,6 +162,19 @@ def test_motion_below_the_noise_is_not_judged():
     assert screen_gyro(gyro_rows(value * DEG), attitude_rows(value), "instant")[1] == []
 
 
+def test_rates_that_no_body_has_are_dropped_and_counted():
+    value = noisy()
+    value[:1] *= 1e9
+    value[10:20, 1] = 1.1e3
+    kept, problems = screen_gyro(gyro_rows(value), NO_ATTITUDE, "instant")
+    assert (len(kept), sum(p.rows for p in problems)) == (989, 11)
+    assert {(p.kind, p.action) for p in problems} == {("too_fast", "dropped")}
+    assert "1100 rad/s" in problems[1].message
+    kept, problems = screen_gyro(gyro_rows(np.full((5000, 3), 1e11)), NO_ATTITUDE, "increment_rad")
+    assert (len(kept), sum(p.rows for p in problems)) == (0, 5000)
+    assert len(problems) < 1100  # the many are summed up
+
+
 def test_gaps():
     time = np.concatenate([np.arange(10), np.arange(12.5, 20), np.arange(30, 35)])
     assert [(gap.start, gap.end, gap.duration) for gap in find_gaps(time)] == [(9, 12.5, 3.5), (19.5, 30, 10.5)]

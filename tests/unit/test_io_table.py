@@ -69,6 +69,7 @@ def test_parquet_types(tmp_path):
             "a": pa.array([1, None, 3], pa.int32()),
             "b": pa.array(["1.5", "x", None]),
             "t": pa.array([0, 1_500_000, None], pa.timestamp("us", "UTC")),
+            **{f"d_{unit}": pa.array([0, 1500, None], pa.duration(unit)) for unit in ("s", "ms", "us", "ns")},
         }
     )
     pa.parquet.write_table(content, tmp_path / "x.parquet")
@@ -76,6 +77,10 @@ def test_parquet_types(tmp_path):
     assert read.row.tolist() == [1, 2, 3]
     assert read.numbers("a").empty.tolist() == [False, True, False]
     assert read.numbers("b").bad.tolist() == [False, True, False]
+    for unit, tick in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):
+        seconds = read.numbers(f"d_{unit}")
+        assert seconds.value[:2].tolist() == [0.0, pytest.approx(1500 * tick, rel=1e-15)]
+        assert seconds.empty.tolist() == [False, False, True]
     assert read.texts("t").to_pylist() == ["1970-01-01 00:00:00.000000Z", "1970-01-01 00:00:01.500000Z", ""]
 
 

@@ -9,6 +9,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from helmstar.errors import DataError
+from helmstar.io.clock import TimeOffsets
 from helmstar.io.columns import ColumnsConfiguration
 from helmstar.io.telemetry import read_telemetry, to_rates
 
@@ -211,6 +212,22 @@ def test_base_rates_are_turned_by_interpolated_attitudes_and_never_extrapolated(
     assert [p.row for p in telemetry.problems] == [*range(2, 12), *range(193, 203)]
 
 
+def test_base_rates_are_turned_by_the_attitude_at_their_time_not_at_their_stamp(tmp_path):
+    data = motion(201, dt=0.05)
+    body = data[GYRO].to_numpy()
+    rates = data[["time_s", *GYRO]].assign(
+        **dict(zip(GYRO, Rotation.from_quat(data[QUATERNION].to_numpy()).inv().apply(body).T))
+    )
+    attitude = data[["time_s", *QUATERNION]].assign(time_s=data["time_s"] - 1.0)
+    base = ColumnsConfiguration(gyro_frame="base")
+    early = read(
+        tmp_path, rates.assign(time_s=rates["time_s"] + 3.0), attitude, columns=base, offsets=TimeOffsets(-3.0, 1.0)
+    )
+    np.testing.assert_allclose(early.gyro.value, body, atol=1e-12)
+    np.testing.assert_allclose(early.gyro.time, early.attitude.time, atol=1e-12)
+    assert early.problems == ()
+
+
 def test_maps_by_file(tmp_path):
     data = motion()
     star = data[["time_s", *QUATERNION]].set_axis(["t", "a", "b", "c", "d"], axis=1)
@@ -289,6 +306,57 @@ def test_a_file_twice_and_no_file(tmp_path):
 def test_the_map_is_checked():
     with pytest.raises(ValidationError, match="quaternion = "):
         ColumnsConfiguration(quaternion_sense="nb")
+    with pytest.raises(ValidationError, match="'wx' is named 2 times"):
+        ColumnsConfiguration(gyro=["wx", "wy", "wx"])
+    with pytest.raises(ValidationError, match="'t' is named 2 times"):
+        ColumnsConfiguration(time="t", star_b=["t", "u", "v"])
+
+
+def test_a_time_of_durations_counts_seconds(tmp_path):
+    data = motion()
+    data.assign(time_s=pd.to_timedelta(data["time_s"], unit="s")).to_parquet(tmp_path / "t.parquet")
+    telemetry = read_telemetry([tmp_path / "t.parquet"])
+    np.testing.assert_array_equal(telemetry.gyro.time, data["time_s"] - 100.0)
+    with pytest.raises(DataError, match="leave out clock_unit_s"):
+        read_telemetry([tmp_path / "t.parquet"], ColumnsConfiguration(clock_unit_s=1e-9))
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ({"gyro": ["gyro_x", "gyro_y", "gyro_z"]}, ["gyro: there is no column gyro_x", "mean 'gyro_x_rad_s'"]),
+        ({"time": "time_ms"}, ["time: there is no column time_ms", "did you mean 'time_s'"]),
+        ({"quaternion": ["q0", "q1", "q2", "q3"]}, ["quaternion: there is no column q0"]),
+    ],
+)
+def test_a_name_that_no_table_has_is_refused_though_there_are_native_columns(tmp_path, columns, words):
+    data, given = motion(), ColumnsConfiguration(**columns)
+    for tables in ([data], [data[["time_s", *GYRO]], data[["time_s", *QUATERNION]]]):
+        with pytest.raises(DataError) as caught:
+            read(tmp_path, *tables, columns=given)
+        assert all(word in str(caught.value) for word in words)
+    # Another map's files and a kind that is not asked for are no reason to complain.
+    read(tmp_path, data, columns=[given.model_copy(update={"file": "other*"})])
+    if "quaternion" in columns:
+        read(tmp_path, data[["time_s", *GYRO]], columns=given, needs=["gyro"])
+
+
+def test_a_map_may_name_what_only_one_of_two_tables_has(tmp_path):
+    data = motion()
+    gyro = data[["time_s", *GYRO]].set_axis(["t", "wx", "wy", "wz"], axis=1)
+    star = data[["time_s", *QUATERNION]]
+    telemetry = read(tmp_path, gyro, star, columns=ColumnsConfiguration(time="t", gyro=["wx", "wy", "wz"]))
+    assert (len(telemetry.gyro), len(telemetry.attitude)) == (50, 50)
+
+
+def test_where_all_rows_of_a_kind_are_bad_the_first_is_named(tmp_path):
+    data = motion()
+    with pytest.raises(DataError, match=r"no usable gyro row, .* row 2: gyro_y_rad_s is NaN"):
+        read(tmp_path, data.assign(gyro_y_rad_s="inf"))
+    with pytest.raises(DataError, match=r"no usable attitude or star row, .* row 2: the quaternion has length"):
+        read(tmp_path, data.assign(q_bn_w=9.0, gyro_x_rad_s=["x", *data["gyro_x_rad_s"][1:]]))
+    with pytest.raises(DataError, match=r"the columns gyro_x_rad_s, .* are empty in every row"):
+        read(tmp_path, data.assign(**dict.fromkeys(GYRO)))
 
 
 @pytest.mark.shared_data

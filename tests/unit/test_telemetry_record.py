@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from telemetry_solving import solve_files
 
 from helmstar.cli import main
+from helmstar.errors import ConfigurationError
 
 ARCSEC = np.pi / 180 / 3600
 DRIFT = np.array([300.0, -120.0, 40.0])
@@ -136,6 +138,36 @@ def test_the_mounting_places_the_large_error(capsys, tmp_path):
     wrong = toml.replace(f"q_sb = [{q}]\n", "")
     _, result, _ = attitude(capsys, tmp_path, wrong)
     assert not 2.2 < result["nis_mean"] < 3.8
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("sigma_cross_arcsec = 3.0\nsigma_roll_arcsec = 30.0", ["sigma_roll_arcsec", "give sigma_arcsec"]),
+        ("q_sb = [0.6, 0.0, 0.8, 0.0]", ["q_sb", "body axes"]),
+    ],
+)
+def test_axes_of_a_tracker_are_refused_where_star_directions_are_measured(tmp_path, line, words):
+    rows = [f"{t},0,0,0,{b},{b}" for t in range(4) for b in ("1,0,0", "0,1,0", "0,0,1")]
+    header = "time_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s," + ",".join(f"star_{f}_{a}" for f in "bn" for a in "xyz")
+    (tmp_path / "t.csv").write_text("\n".join([header, *rows]))
+    with pytest.raises(ConfigurationError) as caught:
+        solve_files([tmp_path / "t.csv"], f"[star]\n{line}\n")
+    assert all(word in str(caught.value) for word in words)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "source", "value"), [(30.0, "taken as 0", 0.0), (1e6, "first two attitudes minus the gyro", None)]
+)
+def test_a_stated_drift_sigma_starts_at_0_unless_it_says_next_to_nothing(capsys, tmp_path, sigma, source, value):
+    simulate(tmp_path, 10, seconds=60)
+    toml = GIVEN.replace("[star]", f"initial_drift_sigma_arcsec_s = {sigma}\n[star]")
+    _, result, _ = attitude(capsys, tmp_path, toml)
+    noise = result["noise"]
+    assert noise["initial_drift_sigma_arcsec_s"] == {"value": [pytest.approx(sigma)] * 3, "source": "sensors.toml"}
+    assert noise["initial_drift_arcsec_s"]["source"] == source
+    if value is not None:
+        assert noise["initial_drift_arcsec_s"]["value"] == [value] * 3
 
 
 def test_a_time_offset_is_added_to_the_stamp(capsys, tmp_path):

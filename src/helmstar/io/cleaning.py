@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,7 +36,8 @@ class Group:
 @dataclass(frozen=True)
 class Part:
     """One table, understood. Values: gyro (n, 3) rad/s or rad in the table's axes, quaternion (n, 4) unit q_BN,
-    stars (n, 6) unit direction in body and in inertial axes; None where the table has no such columns.
+    stars (n, 6) unit direction in body and in inertial axes; None where the table has no such columns. `map` is the one of
+    [columns] that named them.
     """
 
     table: Table
@@ -45,6 +46,7 @@ class Part:
     gyro: Group | None
     quaternion: Group | None
     stars: Group | None
+    map: ColumnsConfiguration | None = None
 
     def groups(self) -> list[Group]:
         """Those it has."""
@@ -53,9 +55,10 @@ class Part:
 
 def clean(table: Table, maps: Sequence[ColumnsConfiguration], log: ProblemLog) -> Part:
     """Understand a table's columns by `maps` or native names, and note every bad row in `log`."""
-    layout = resolve(table.file, list(table.columns), map_for(table.file, maps))
+    given = map_for(table.file, maps)
+    layout = resolve(table.file, list(table.columns), given)
     instants, timed = _times(table, layout, log)
-    return clean_timed(table, layout, instants, timed, log)
+    return replace(clean_timed(table, layout, instants, timed, log), map=given)
 
 
 def clean_timed(table: Table, layout: Layout, instants: Instants, timed: np.ndarray, log: ProblemLog) -> Part:
@@ -97,6 +100,10 @@ def clean_timed(table: Table, layout: Layout, instants: Instants, timed: np.ndar
 
 def _times(table: Table, layout: Layout, log: ProblemLog) -> tuple[Instants, np.ndarray]:
     """The time of each row, and which rows have one."""
+    if table.is_duration(layout.time) and layout.clock_unit_s != 1.0:
+        raise DataError(
+            f"{table.file}: the time {layout.time!r} is of a type that knows its unit (durations); leave out clock_unit_s"
+        )
     texts = table.texts(layout.time) if layout.scale in ("utc", "tai", "gps") else None
     numbers = table.numbers(layout.time)
     numeric = np.isfinite(numbers.value).sum() * 2 > len(table)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import erfa
 import numpy as np
@@ -35,8 +35,18 @@ _FARTHEST_DATE_S = 1e11  # 3000 years: beyond it a number is no time of telemetr
 _ISO = (
     r"^(?P<year>\d{4})-(?:(?P<month>\d\d)-(?P<day>\d\d)|(?P<doy>\d{3}))[T ]"
     r"(?P<hour>\d\d):(?P<minute>\d\d)(?::(?P<second>\d\d(?:\.\d*)?))?"
-    r" ?(?P<zone>Z|[+-]\d\d:?\d\d)?$"
+    r" ?(?P<zone>Z|[+-](?:[01]\d|2[0-3]):?[0-5]\d)?$"
 )
+
+
+class TimeOffsets(NamedTuple):
+    """What is added to the stamps of gyro and of star rows, s, to make them the times of their samples."""
+
+    gyro: float = 0.0
+    star: float = 0.0
+
+
+NO_OFFSETS = TimeOffsets()
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ class ColumnsConfiguration(BaseModel):
         default=None, description="what the time counts; 's' is any clock of plain seconds"
     )
     clock_unit_s: float | None = Field(
-        default=None, gt=0, allow_inf_nan=False, description="seconds per unit of a numeric time"
+        default=None, gt=0, ge=1e-12, le=1e8, allow_inf_nan=False, description="seconds per unit of a numeric time"
     )
     gyro: Triple | None = Field(default=None, description="columns with the rates about x, y, z")
     gyro_unit: GyroUnit | None = Field(
@@ -91,6 +91,19 @@ class ColumnsConfiguration(BaseModel):
                     f'{key} is for foreign columns: name them too, as quaternion = ["q0", "q1", "q2", "q3"]'
                 )
         return self
+
+    @model_validator(mode="after")
+    def _each_column_once(self) -> ColumnsConfiguration:
+        names = [name for group in self.names().values() for name in group]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"the column {twice[0]!r} is named {names.count(twice[0])} times; a column is one thing")
+        return self
+
+    def names(self) -> dict[str, list[str]]:
+        """The columns that are named, by key."""
+        groups = {"gyro": self.gyro, "quaternion": self.quaternion, "star_b": self.star_b, "star_n": self.star_n}
+        return {"time": [self.time] if self.time else [], **{key: list(group or []) for key, group in groups.items()}}
 
 
 @dataclass(frozen=True)
@@ -152,8 +165,7 @@ def resolve(file: str, found: Sequence[str], given: ColumnsConfiguration) -> Lay
     time = next((name for name in (given.time, *NATIVE_TIME) if name in found), None)
     if not (gyro or quaternion or star_b) or time is None:
         what = "no time" if time is None else "no gyro, attitude or star"
-        mapped = [name for name in (given.time, *(given.gyro or ()), *(given.quaternion or ())) if name]
-        absent = [name for name in mapped if name not in found]
+        absent = [name for names in given.names().values() for name in names if name not in found]
         hint = f"\n[columns] names what is not there: {_absent(absent, found)}." if absent else ""
         details = indent(f"Columns found: {_listed(found)}{hint}\n{_REMEDY}", "  ")
         raise DataError(f"{details}\n{file}: {what} column is known; what a table needs stands above")
@@ -174,6 +186,25 @@ def resolve(file: str, found: Sequence[str], given: ColumnsConfiguration) -> Lay
         star_b=star_b,
         star_n=star_n,
     )
+
+
+def refuse_unknown(
+    given: ColumnsConfiguration, tables: Sequence[tuple[Sequence[str], Layout]], needs: Sequence[str]
+) -> None:
+    """Raise a DataError for a map with a name that none of the tables it is used for has (columns and layout of each).
+
+    One table may lack what another has. What is not among `needs` ("gyro", "star") may lie in a table that is not
+    given, unless a native column is taken in its place.
+    """
+    found = list(dict.fromkeys(name for columns, _ in tables for name in columns))
+    for key, names in given.names().items():
+        absent = [name for name in names if name not in found]
+        needed = key == "time" or ("gyro" if key == "gyro" else "star") in needs
+        if absent and tables and (needed or any(getattr(layout, key) for _, layout in tables)):
+            raise DataError(
+                f"  Columns found: {_listed(found)}\n[columns] {key}: {_absent(absent, found)} in any table that this map "
+                "is for; correct the name, leave it out, or give the map a file pattern ([[columns]] with file = ...)"
+            )
 
 
 def _absent(missing: Sequence[str], found: Sequence[str]) -> str:

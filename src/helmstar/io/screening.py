@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .problems import Problem
+from .problems import Problem, ProblemLog
 from .telemetry import AttitudeRows, GyroRows, Reading, to_rates
 
 DEG = 180.0 / math.pi  # 57.2958, the factor between numbers in degrees and in radians
@@ -21,6 +21,7 @@ SPIKES_ARE_RARE = 0.02  # more of them are the nature of the data
 UNIT_TOLERANCE = 0.2  # relative, between a row and 57.3 times its neighbour
 UNIT_SIGMAS = 10.0  # the smaller of the two must stand out of the noise, or its 57.3-fold says nothing
 GAP_FACTOR = 3.0
+FASTEST_RAD_S = 1e3  # 57 000 deg/s, several times what any gyro measures
 
 
 @dataclass(frozen=True)
@@ -42,12 +43,15 @@ def find_gaps(time: np.ndarray, factor: float = GAP_FACTOR) -> list[Gap]:
 
 
 def screen_gyro(gyro: GyroRows, attitude: AttitudeRows, reading: Reading) -> tuple[GyroRows, list[Problem]]:
-    """Convert a file that is in degrees where radians are said (or the reverse), drop rows that are, drop spikes.
+    """Drop rates that no body has, convert a file that is in degrees where radians are said (or the reverse), drop rows
+    that are, drop spikes.
 
     `reading` says what a value is: the rate at its time, the mean rate since the row before, or the increment since.
     """
     rates, mean = to_rates(gyro, reading)
-    problems: list[Problem] = []
+    fast = np.linalg.norm(rates.value, axis=1) > FASTEST_RAD_S
+    problems = _too_fast(rates.select(fast))
+    gyro, rates = gyro.select(~fast), rates.select(~fast)
     for i in np.unique(gyro.file):
         mine = gyro.file == i
         factor = _unit_factor(rates.select(mine), attitude, mean)
@@ -61,6 +65,20 @@ def screen_gyro(gyro: GyroRows, attitude: AttitudeRows, reading: Reading) -> tup
             problems.append(Problem(gyro.files[gyro.file[j]], int(gyro.row[j]), kind, message, "dropped"))
         gyro, rates = gyro.select(~bad), rates.select(~bad)
     return gyro, problems
+
+
+def _too_fast(rates: GyroRows) -> list[Problem]:
+    """One entry for each row, the many of a file summed up."""
+    log = ProblemLog()
+    for i in np.unique(rates.file):
+        mine = rates.file == i
+        size = np.linalg.norm(rates.value[mine], axis=1)
+        log.add(
+            rates.files[i], rates.row[mine], "too_fast",
+            lambda k, size=size: f"a rate of {size[k]:.4g} rad/s, which is no body's; are unit and `reading` right?",
+            "dropped",
+        )  # fmt: skip
+    return list(log.problems())
 
 
 # ----------------------------------------------------------------------------- a whole file in the wrong unit

@@ -25,6 +25,7 @@ from .problems import Problem, ProblemLog
 pc: Any = pyarrow.compute  # makes its functions when imported, which no type checker sees
 
 _PARQUET_MAGIC = b"PAR1"
+_TICKS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}  # in a second, of a duration's unit
 _BLANKS = " "  # stands for any run of blanks
 
 
@@ -65,9 +66,17 @@ class Table:
             raise DataError(f"{self.file}: column {name!r} holds {cells.type}, neither text nor times") from error
         return pc.fill_null(pc.utf8_trim_whitespace(cells), "")
 
+    def is_duration(self, name: str) -> bool:
+        """Whether a Parquet column holds durations, which `numbers` gives in s."""
+        return pa.types.is_duration(self.column(name).type)
+
     def numbers(self, name: str) -> Numbers:
-        """The cells of a column as float64."""
+        """The cells of a column as float64; durations in s."""
         cells = self.column(name)
+        if self.is_duration(name):
+            ticks = pc.cast(cells, pa.int64())
+            value = _to_numpy(pc.cast(ticks, pa.float64(), safe=False)) / _TICKS[cells.type.unit]
+            return Numbers(value, _to_numpy(pc.is_null(cells)), np.zeros(len(self), bool))
         if pa.types.is_floating(cells.type) or pa.types.is_integer(cells.type) or pa.types.is_decimal(cells.type):
             value = pc.cast(cells, pa.float64(), safe=False)
             return Numbers(_to_numpy(value), _to_numpy(pc.is_null(value)), np.zeros(len(self), bool))

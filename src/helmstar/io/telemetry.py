@@ -15,8 +15,8 @@ import numpy as np
 
 from ..errors import DataError
 from .cleaning import SAME_TIME_S, Part
-from .clock import Instants, Origin
-from .columns import ColumnsConfiguration
+from .clock import NO_OFFSETS, Instants, Origin, TimeOffsets
+from .columns import ColumnsConfiguration, refuse_unknown
 from .formats import read_part
 from .problems import Problem, ProblemLog, refuse
 from .settings import FormatSettings
@@ -99,7 +99,10 @@ class DirectionRows(Rows):
 
 @dataclass(frozen=True)
 class Telemetry:
-    """All rows of all files. `clock` says in words what the times are; `origin` turns them back into dates."""
+    """All rows of all files. `clock` says in words what the times are; `origin` turns them back into dates.
+
+    The rows' times have `offsets` in them already.
+    """
 
     gyro: GyroRows
     attitude: AttitudeRows
@@ -107,6 +110,7 @@ class Telemetry:
     problems: tuple[Problem, ...]
     clock: str
     origin: Origin
+    offsets: TimeOffsets = NO_OFFSETS
 
 
 def read_telemetry(
@@ -117,12 +121,13 @@ def read_telemetry(
     needs: Sequence[Literal["gyro", "star"]] = ("gyro", "star"),
     max_problems: int = 1000,
     settings: FormatSettings | None = None,
+    offsets: TimeOffsets = NO_OFFSETS,
 ) -> Telemetry:
     """Read tables (CSV, Parquet) and files of the formats that `formats` knows into one telemetry.
 
-    `columns`: one map for all tables, or several with a `file` pattern each; `settings` are for the formats. `needs`:
-    what must be there, "star" being attitudes or star directions. With `strict` any bad row is a DataError; otherwise bad
-    rows are listed in `problems`, per file and kind the first `max_problems` by row.
+    `columns`: one map for all tables, or several with a `file` pattern each; `settings` are for the formats. `offsets`
+    are added to the stamps. `needs`: what must be there, "star" being attitudes or star directions. With `strict` any bad
+    row is a DataError; otherwise bad rows are listed in `problems`, per file and kind the first `max_problems` by row.
     """
     maps = [] if columns is None else [columns] if isinstance(columns, ColumnsConfiguration) else list(columns)
     names = [str(file) for file in files]
@@ -133,6 +138,9 @@ def read_telemetry(
             raise DataError(f"{name}: the file is given twice; name each file once")
     log = ProblemLog(max_problems)
     parts = [read_part(Path(name), maps, log, settings, max_problems) for name in names]
+    for entry in maps:
+        tables = [(list(part.table.columns), part.layout) for part in parts if part.map is entry]
+        refuse_unknown(entry, tables, needs)
     origin = _common_origin(parts)
 
     gyro = _gyro_rows(parts, origin, log)
@@ -140,19 +148,36 @@ def read_telemetry(
     stars = _gather(parts, origin, "stars", log, ("both", 6))
     both = stars.pop("both")
     directions = DirectionRows(**stars, star_B=both[:, :3], star_N=both[:, 3:]) if len(both) else None
+    # Before anything looks from one kind of rows to the other: base rates are turned by the attitude of their instant.
+    gyro = replace(gyro, time=gyro.time + offsets.gyro)
+    attitude = replace(attitude, time=attitude.time + offsets.star)
+    if directions is not None:
+        directions = replace(directions, time=directions.time + offsets.star)
     gyro = _turn_into_body(gyro, [part.layout.gyro_frame == "base" for part in parts], attitude, log)
 
     problems = _in_order((*(problem for part in parts for problem in part.table.problems), *log.problems()), names)
     if strict:
         refuse(problems)
     if "gyro" in needs and not len(gyro):
-        raise DataError(f"{', '.join(names)}: no usable gyro row; give gyro_x_rad_s, _y_, _z_ or map them in [columns]")
+        raise DataError(_why_none(parts, problems, "gyro", ("gyro",), "give gyro_x_rad_s, _y_, _z_"))
     if "star" in needs and not len(attitude) and directions is None:
-        raise DataError(
-            f"{', '.join(names)}: no usable attitude or star row; give q_bn_x, _y, _z, _w (or star_b_x ... with "
-            "star_n_x ...), in the same table or as a further file, or map them in [columns]"
-        )
-    return Telemetry(gyro, attitude, directions, problems, _clock_in_words(parts, origin), origin)
+        remedy = "give q_bn_x, _y, _z, _w (or star_b_x ... with star_n_x ...), in the same table or as a further file,"
+        raise DataError(_why_none(parts, problems, "attitude or star", ("quaternion", "star_b", "star_n"), remedy))
+    return Telemetry(gyro, attitude, directions, problems, _clock_in_words(parts, origin), origin, offsets)
+
+
+def _why_none(parts: Sequence[Part], problems: Sequence[Problem], what: str, kinds: Sequence[str], remedy: str) -> str:
+    """What to say where no row of a kind is usable: that the columns are not there, or what is wrong with their rows."""
+    files = ", ".join(part.table.file for part in parts)
+    columns = {part.table.file: [n for kind in kinds for n in getattr(part.layout, kind)] for part in parts}
+    names = list(dict.fromkeys(name for group in columns.values() for name in group))
+    if not names:
+        return f"{files}: no usable {what} row; {remedy} or map them in [columns]"
+    words = (*names, *(("rates",) if "gyro" in kinds else ("quaternion", "direction")))  # of messages about such rows
+    bad = [p for p in problems if p.action == "dropped" and columns.get(p.file)]
+    bad = [p for p in bad if any(word in p.message for word in words)] or bad
+    reason = f"for one, {bad[0]}" if bad else f"the columns {', '.join(names)} are empty in every row that has a time"
+    return f"{files}: no usable {what} row, though there are columns; {reason}"
 
 
 def _common_origin(parts: Sequence[Part]) -> Origin:

@@ -25,6 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from ..configuration import explain, read_toml
 from ..errors import ConfigurationError
+from ..io.clock import TimeOffsets
 from ..io.columns import ColumnsConfiguration
 from ..io.settings import AemConfiguration, FormatSettings, GraceFoConfiguration, SpiceConfiguration
 
@@ -43,6 +44,22 @@ BIAS_INSTABILITY_UNITS = {"bias_instability_arcsec_s": ARCSEC, "bias_instability
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Offset = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
+
+# Far beyond any sensor on either side, and near enough to 1 that squares and covariances keep their digits.
+ARW_LIMITS = (1e-15, 10.0)  # rad/sqrt(s)
+RRW_LIMITS = (1e-15, 10.0)  # rad/s/sqrt(s)
+DRIFT_LIMITS_ARCSEC_S = (1e-9, 2e8)
+STAR_LIMITS_ARCSEC = (1e-6, 648000.0)
+LARGEST_SIGMA_RATIO = 1e6
+
+
+def _refuse_extremes(name: str, value: float | None, low: float, high: float) -> None:
+    """Raise a ValueError for a positive value outside its limits."""
+    if value and not low <= value <= high:
+        raise ValueError(
+            f"{name} = {value:g} is out of range: values from {low:.3g} to {high:.3g} are of a real sensor"
+        )
 
 
 class _Table(BaseModel):
@@ -72,12 +89,16 @@ class GyroConfiguration(_Table):
     bias_instability_deg_h: NotNegative | None = Field(default=None, description="informative; no filter uses it")
     initial_drift_sigma_arcsec_s: Positive | None = None
     reading: Literal["instant", "mean_since_previous", "increment_rad"] = "instant"
-    time_offset_s: Finite = Field(default=0.0, description="time of a sample = its stamp + this")
+    time_offset_s: Offset = Field(default=0.0, description="time of a sample = its stamp + this")
 
     @model_validator(mode="after")
     def _one_unit_each(self) -> GyroConfiguration:
         for units in (ARW_UNITS, RRW_UNITS, BIAS_INSTABILITY_UNITS):
             self._refuse_two(units)
+        for units, (low, high) in ((ARW_UNITS, ARW_LIMITS), (RRW_UNITS, RRW_LIMITS)):
+            for key, unit in units.items():
+                _refuse_extremes(key, getattr(self, key), low / unit, high / unit)
+        _refuse_extremes("initial_drift_sigma_arcsec_s", self.initial_drift_sigma_arcsec_s, *DRIFT_LIMITS_ARCSEC_S)
         return self
 
     @property
@@ -109,7 +130,7 @@ class StarConfiguration(_Table):
     sigma_cross_arcsec: Positive | None = Field(default=None, description="about x and y of S, across the boresight")
     sigma_roll_arcsec: Positive | None = Field(default=None, description="about z of S, the boresight")
     q_sb: Annotated[list[Finite], Field(min_length=4, max_length=4)] | None = None
-    time_offset_s: Finite = Field(default=0.0, description="time of a sample = its stamp + this")
+    time_offset_s: Offset = Field(default=0.0, description="time of a sample = its stamp + this")
 
     @field_validator("q_sb")
     @classmethod
@@ -126,6 +147,15 @@ class StarConfiguration(_Table):
             raise ValueError(f"sigma_{given}_arcsec needs sigma_{lacking}_arcsec beside it")
         if across and self.sigma_arcsec is not None:
             raise ValueError("give either sigma_arcsec or sigma_cross_arcsec with sigma_roll_arcsec, not all of them")
+        for key in ("sigma_arcsec", "sigma_cross_arcsec", "sigma_roll_arcsec"):
+            _refuse_extremes(key, getattr(self, key), *STAR_LIMITS_ARCSEC)
+        if self.sigma_cross_arcsec is not None and self.sigma_roll_arcsec is not None:
+            ratio = self.sigma_roll_arcsec / self.sigma_cross_arcsec
+            if not 1.0 / LARGEST_SIGMA_RATIO <= ratio <= LARGEST_SIGMA_RATIO:
+                raise ValueError(
+                    f"sigma_roll_arcsec is {ratio:.3g} times sigma_cross_arcsec; up to {LARGEST_SIGMA_RATIO:.0e} times "
+                    "can be computed with"
+                )
         return self
 
     @property
@@ -163,7 +193,7 @@ class FilterConfiguration(_Table):
     gate_probability: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = Field(
         default=1e-6, description="a good measurement is refused this often; 0 refuses none"
     )
-    reopen_after: Annotated[int, Field(ge=1)] = Field(
+    reopen_after: Annotated[int, Field(ge=1, le=1_000_000)] = Field(
         default=5, description="refusals in a row after which one is accepted"
     )
 
@@ -178,6 +208,11 @@ class SensorsConfiguration(_Table):
     gracefo: GraceFoConfiguration = GraceFoConfiguration()
     aem: AemConfiguration = AemConfiguration()
     spice: SpiceConfiguration = SpiceConfiguration()
+
+    @property
+    def time_offsets(self) -> TimeOffsets:
+        """What reading a telemetry has to add to its stamps."""
+        return TimeOffsets(self.gyro.time_offset_s, self.star.time_offset_s)
 
     def formats(self, folder: Path | None = None) -> FormatSettings:
         """What the readers of other formats need; relative file names may be meant from `folder`."""

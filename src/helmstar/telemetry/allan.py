@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +96,9 @@ def run_allan(
 ) -> tuple[dict[str, Any], Path]:
     """The whole command: returns the object of `--json` and the report's path. Raises HelmstarError."""
     sensors = load_sensors(config)
-    telemetry = read_telemetry(files, sensors.columns or None, strict=strict, needs=("gyro",))
+    telemetry = read_telemetry(
+        files, sensors.columns or None, strict=strict, needs=("gyro",), offsets=sensors.time_offsets
+    )
     file = ", ".join(str(f) for f in files)
     series, axes, basis, problems, gaps = _best_basis(telemetry, sensors, file, strict)
     if strict:
@@ -138,9 +140,8 @@ def run_allan(
 
 def _best_basis(telemetry: Telemetry, sensors: SensorsConfiguration, file: str, strict: bool):
     """Series, axes, what they are of ("gyro" or "gyro minus attitude"), all problems, gaps of the gyro."""
-    gyro = replace(telemetry.gyro, time=telemetry.gyro.time + sensors.gyro.time_offset_s)
-    attitude = replace(telemetry.attitude, time=telemetry.attitude.time + sensors.star.time_offset_s)
-    gyro, found = screen_gyro(gyro, attitude, sensors.gyro.reading)
+    attitude = telemetry.attitude
+    gyro, found = screen_gyro(telemetry.gyro, attitude, sensors.gyro.reading)
     problems = [*telemetry.problems, *found]
     if strict:
         refuse(problems)

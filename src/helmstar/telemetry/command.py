@@ -20,7 +20,7 @@ from ..sensors.configuration import load_sensors
 from ..versions import versions
 from .estimate import Estimates
 from .export import check_export, write_exports
-from .solve import ARCSEC, Solution, solve
+from .solve import ARCSEC, FROM_ATTITUDES, Solution, solve
 
 STATUS = {ACCEPTED: "accepted", GATED: "gated", REOPENED: "reopened", FORCED: "forced"}
 
@@ -67,7 +67,7 @@ def _consistency(solution: Solution) -> dict[str, Any]:
 
     u = solution.updates
     used = u.status == ACCEPTED
-    if solution.start_source != "sensors.toml" and len(used):
+    if solution.sources["drift"] == FROM_ATTITUDES and len(used):
         used = used & (np.arange(len(used)) > 0)  # the first one's residual went into the start
     nis, dof = u.nis[used], u.dof[used]
     if not len(nis):
@@ -98,11 +98,8 @@ def _noise(solution: Solution) -> dict[str, Any]:
         "arw_arcsec_sqrt_s": entry(levels.sigma_v / ARCSEC, "sigma_v"),
         "rrw_arcsec_s_sqrt_s": entry(levels.sigma_u / ARCSEC, "sigma_u"),
         "star_sigma_arcsec": entry([float(v) for v in star_sigma / ARCSEC], "sigma"),
-        "initial_drift_arcsec_s": {"value": [float(v) for v in s.start.drift / ARCSEC], "source": s.start_source},
-        "initial_drift_sigma_arcsec_s": {
-            "value": [float(v) for v in s.start.drift_sigma / ARCSEC],
-            "source": s.start_source,
-        },
+        "initial_drift_arcsec_s": entry([float(v) for v in s.start.drift / ARCSEC], "drift"),
+        "initial_drift_sigma_arcsec_s": entry([float(v) for v in s.start.drift_sigma / ARCSEC], "drift_sigma"),
     }
 
 
@@ -158,7 +155,9 @@ def run_attitude(
     """The whole command: returns the object of `--json` and the report's path. Raises HelmstarError."""
     sensors = load_sensors(config)
     settings = sensors.formats(None if config is None else Path(config).parent)
-    telemetry = read_telemetry(files, sensors.columns or None, strict=strict, settings=settings)
+    telemetry = read_telemetry(
+        files, sensors.columns or None, strict=strict, settings=settings, offsets=sensors.time_offsets
+    )
     check_export(telemetry.origin, aem=aem, ck=ck)
     solution = solve(telemetry, sensors, strict, progress=True)
     result = result_of(solution, telemetry, files, command)

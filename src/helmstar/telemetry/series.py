@@ -47,8 +47,22 @@ class Series:
         return (Rotation.from_quat(self.D[1:]) * Rotation.from_quat(self.D[:-1]).inv()).as_rotvec()
 
     def drifts(self) -> np.ndarray:
-        """Drift (m - 1, 3) in rad/s that each pair of neighbours implies."""
-        return self.drift + np.linalg.solve(np.diff(self.A, axis=0), self.steps()[..., None])[..., 0]
+        """Drift (m - 1, 3) in rad/s that each pair of neighbours implies, as far as it shows in them."""
+        return self.drift + np.einsum("mab,mb->ma", pseudo_inverse(np.diff(self.A, axis=0)), self.steps())
+
+
+UNSEEN = 1e-3
+"""A body that turns fully round between two attitudes hides its drift across the axis: A then is singular. What A shrinks
+by more than this, relative to the axis it shrinks least, counts as not seen."""
+
+
+def pseudo_inverse(A: np.ndarray, unseen: float = 0.0) -> np.ndarray:
+    """Inverse (..., 3, 3) of finite A, with directions that are `UNSEEN` given this share of the largest they may have
+    (0: no drift is concluded in them; 1: its variance is still as large as can be told)."""
+    U, s, Vt = np.linalg.svd(A)
+    floor = np.maximum(UNSEEN * s[..., :1], np.finfo(float).tiny)
+    inverse = np.where(s > floor, 1.0, unseen) / np.maximum(s, floor)
+    return np.swapaxes(Vt, -1, -2) * inverse[..., None, :] @ np.swapaxes(U, -1, -2)
 
 
 def bring_back(timeline: Timeline, epochs: Epochs, drift: np.ndarray) -> Series:
@@ -56,11 +70,13 @@ def bring_back(timeline: Timeline, epochs: Epochs, drift: np.ndarray) -> Series:
     dt = np.diff(timeline.time)[:, None]
     phi = (timeline.rate - drift) * dt
     P = cumulative(-phi)
-    # d A = P^-1 dt over a step that turns by -phi to its end: dt (I - hat/2 + hat^2/6) there, good for steps up to 0.1 rad
+    # d A = P^-1 dt over a step that turns by -phi to its end: dt J(-phi) there, J being the left Jacobian of SO(3)
     hat = np.zeros((len(phi), 3, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         hat[:, i, j], hat[:, j, i] = -phi[:, k], phi[:, k]
-    local = (np.eye(3) - 0.5 * hat + hat @ hat / 6.0) * dt[..., None]
+    angle = np.linalg.norm(phi, axis=1)[:, None, None]
+    first, second = 0.5 * np.sinc(0.5 / np.pi * angle) ** 2, _third_order(angle)
+    local = (np.eye(3) - first * hat + second * hat @ hat) * dt[..., None]
     back = Rotation.from_quat(P).inv().as_matrix()
     A = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(back[1:] @ local, axis=0)])
     extra = np.concatenate([np.zeros((1, 3)), np.cumsum(timeline.extra, axis=0)])
@@ -72,6 +88,13 @@ def bring_back(timeline: Timeline, epochs: Epochs, drift: np.ndarray) -> Series:
     D = (Rotation.from_quat(P[at]).inv() * Rotation.from_quat(epochs.q_BN[e])).as_quat()
     shape = M @ epochs.shape[e] @ np.swapaxes(M, 1, 2)
     return Series(e, timeline.time[at], D, A[at], shape, extra[at], drift)
+
+
+def _third_order(angle: np.ndarray) -> np.ndarray:
+    """(x - sin x) / x^3, by its series where the difference would lose digits."""
+    x = np.maximum(angle, 0.1)
+    series = 1.0 / 6.0 - angle**2 / 120.0 + angle**4 / 5040.0 - angle**6 / 362880.0
+    return np.where(angle < 0.1, series, (x - np.sin(x)) / x**3)
 
 
 def cumulative(turns: np.ndarray) -> np.ndarray:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..core import ACCEPTED, FORCED, Gate, chi_square_gate, no_gate
-from ..errors import DataError
-from ..io.problems import Problem, refuse
+from ..errors import ConfigurationError, DataError
+from ..io.problems import Problem, for_one, refuse
 from ..io.screening import screen_gyro
 from ..io.telemetry import AttitudeRows, GyroRows, Telemetry, to_rates
 from ..progress import Progress
@@ -22,13 +22,15 @@ from .start import DIFFUSE, Beginning, find_beginning
 from .timeline import Epochs, Timeline, attitude_epochs, build_timeline, reachable
 
 ARCSEC = np.pi / 180.0 / 3600.0
+FROM_ATTITUDES = "first two attitudes minus the gyro"
 NOT_USED = "not used"
 """Action on rows that are good but of no use here: neither rejected nor an error when reading is strict."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """All that was estimated of one record. `gyro`: the rows that were used; `used` (m,): the epochs that entered."""
+    """All that was estimated of one record. `gyro`: the rows that were used; `used` (m,): the epochs that entered;
+    `sources`: where each noise level and the start's drift and its sigma are from."""
 
     gyro: GyroRows
     timeline: Timeline
@@ -40,7 +42,6 @@ class Solution:
     levels: NoiseLevels
     sources: dict[str, str]
     start: Start
-    start_source: str
     problems: tuple[Problem, ...]
     gate: Gate
 
@@ -48,10 +49,27 @@ class Solution:
 def solve(
     telemetry: Telemetry, sensors: SensorsConfiguration, strict: bool = False, progress: bool = False
 ) -> Solution:
-    """Filter and smooth a record.
+    """Filter and smooth a record, read with the time offsets of `sensors`.
 
-    Raises DataError when the rows do not suffice, or, with `strict`, when one of them is bad.
+    Raises DataError when the rows do not suffice, or, with `strict`, when one of them is bad; ConfigurationError when
+    `sensors` speaks of what the rows cannot have; ValueError when the record
+    was read with other time offsets.
     """
+    if telemetry.offsets != sensors.time_offsets:
+        raise ValueError(
+            f"the record was read with {telemetry.offsets}, the configuration says {sensors.time_offsets}: give "
+            "read_telemetry(..., offsets=sensors.time_offsets)"
+        )
+    try:
+        return _solve(telemetry, sensors, strict, progress)
+    except (np.linalg.LinAlgError, FloatingPointError, OverflowError) as error:
+        raise DataError(
+            f"{', '.join(telemetry.gyro.files)}: the numbers cannot be computed with ({error}); check the times for jumps, "
+            "the units of times and rates, and the noise in sensors.toml"
+        ) from error
+
+
+def _solve(telemetry: Telemetry, sensors: SensorsConfiguration, strict: bool, progress: bool) -> Solution:
     problems = list(telemetry.problems)
 
     def check() -> None:
@@ -68,7 +86,7 @@ def solve(
         gate = _gate(sensors)
         epochs, used, beginning, levels, sources = _begin(signal, epochs, sensors, gate, problems)
         bar.advance(task)
-        start, start_source = _start(sensors, epochs, levels, beginning)
+        start, start_sources = _start(sensors, epochs, levels, beginning)
         timeline = build_timeline(signal, epochs)
         bar.finish(task)
         record = Record(timeline, epochs, levels, used)
@@ -80,7 +98,7 @@ def solve(
     problems += _refused(timeline, epochs, updates, gate)
     check()
     return Solution(
-        gyro, timeline, epochs, used, filtered, smoothed, updates, levels, sources, start, start_source,
+        gyro, timeline, epochs, used, filtered, smoothed, updates, levels, sources | start_sources, start,
         tuple(problems), gate,
     )  # fmt: skip
 
@@ -96,18 +114,16 @@ def _inputs(
 ) -> tuple[GyroRows, RateSignal, Epochs]:
     """Gyro rows, their rate signal and star epochs on one clock, with bad rows screened out."""
     gyro, attitude, directions = telemetry.gyro, telemetry.attitude, telemetry.directions
-    gyro = replace(gyro, time=gyro.time + sensors.gyro.time_offset_s)
     if len(attitude):
         if directions is not None:
             message = "star directions are not used beside whole attitudes"
             problems.append(
                 Problem(directions.files[0], int(directions.row[0]), "unused", message, NOT_USED, len(directions))
             )
-        attitude = replace(attitude, time=attitude.time + sensors.star.time_offset_s)
         shape = sensors.star.covariance_B()
         epochs = attitude_epochs(attitude, np.eye(3) if shape is None else shape)
     elif directions is not None:
-        directions = replace(directions, time=directions.time + sensors.star.time_offset_s)
+        _refuse_axes(sensors)
         sigma_S = sensors.star.sigma_S
         epochs, found = direction_epochs(
             directions, None if sigma_S is None else float(sigma_S[0]), sensors.filter.gate_probability
@@ -121,10 +137,25 @@ def _inputs(
     problems += found
     if len(gyro) < 2:
         name = ", ".join(gyro.files) or "telemetry"
-        raise DataError(f"{name}: {len(gyro)} usable gyro rows; at least 2 are needed")
+        raise DataError(f"{name}: {len(gyro)} usable gyro rows; at least 2 are needed{for_one(found)}")
     rates, reading = to_rates(gyro, sensors.gyro.reading)
     increments = gyro.quantity == "increment" or sensors.gyro.reading == "increment_rad"
     return gyro, rate_signal(rates.time, rates.value, rates.step, reading, increments), epochs
+
+
+def _refuse_axes(sensors: SensorsConfiguration) -> None:
+    """Raise a ConfigurationError for what is said of a tracker's axes where directions of stars are measured."""
+    if sensors.star.sigma_roll_arcsec is not None:
+        raise ConfigurationError(
+            "[star] sigma_cross_arcsec, sigma_roll_arcsec: these are of whole attitudes, but the files hold star "
+            "directions; give sigma_arcsec, 1 sigma of a direction across itself (how well the stars of one time tell the "
+            "roll follows from where they stand)"
+        )
+    if not np.allclose(sensors.star.R_SB, np.eye(3), rtol=0.0, atol=1e-12):
+        raise ConfigurationError(
+            "[star] q_sb: it places the errors of whole attitudes, but the files hold star directions, which are in body "
+            "axes (star_b_x, _y, _z); leave q_sb out, and turn directions that are in the tracker's axes: v_B = R_SB^T v_S"
+        )
 
 
 def _within(signal: RateSignal, epochs: Epochs, problems: list[Problem]) -> Epochs:
@@ -205,17 +236,17 @@ def _misfit(epochs: Epochs) -> tuple[float, float]:
 
 def _start(
     sensors: SensorsConfiguration, epochs: Epochs, levels: NoiseLevels, beginning: Beginning
-) -> tuple[Start, str]:
-    """The belief at the first epoch, and where its drift comes from."""
+) -> tuple[Start, dict[str, str]]:
+    """The belief at the first epoch, and where its "drift" and "drift_sigma" come from."""
     cov = epochs.shape[0] * levels.sigma**2
     given = sensors.gyro.initial_drift_sigma
     if given is None:
-        return Start(
-            epochs.q_BN[0], cov, beginning.drift, DIFFUSE * beginning.sigma
-        ), "first two attitudes minus the gyro"
+        start = Start(epochs.q_BN[0], cov, beginning.drift, DIFFUSE * beginning.sigma)
+        return start, {"drift": FROM_ATTITUDES, "drift_sigma": FROM_ATTITUDES}
     # A drift far less known than two attitudes tell it is best linearised about what they tell.
     vague = given > DIFFUSE * float(np.max(beginning.sigma))
-    return Start(epochs.q_BN[0], cov, beginning.drift if vague else np.zeros(3), np.full(3, given)), "sensors.toml"
+    start = Start(epochs.q_BN[0], cov, beginning.drift if vague else np.zeros(3), np.full(3, given))
+    return start, {"drift": FROM_ATTITUDES if vague else "taken as 0", "drift_sigma": "sensors.toml"}
 
 
 def _refused(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate) -> list[Problem]:
@@ -233,4 +264,4 @@ def _refused(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate) -
     return out
 
 
-__all__ = ["ARCSEC", "NOT_USED", "Solution", "solve"]
+__all__ = ["ARCSEC", "FROM_ATTITUDES", "NOT_USED", "Solution", "solve"]

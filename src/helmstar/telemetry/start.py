@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .noise import NoiseLevels
-from .series import Series
+from .series import Series, pseudo_inverse
 
 WINDOW = 12
 """Attitudes that are looked at together."""
@@ -73,10 +73,11 @@ class _Window:
 
     def drift(self, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
         """Drift (3,) from attitude i to j, and its sigma (3,)."""
-        inverse = np.linalg.inv(self.A[j] - self.A[i])
+        between = self.A[j] - self.A[i]
+        inverse = pseudo_inverse(between, 1.0)
         T = abs(self.t[j] - self.t[i])
         cov = self.S[i] + self.S[j] + np.diag(np.abs(self.c[j] - self.c[i]) + self.sigma_u**2 * T**3 / 3.0)
-        return inverse @ self.y[i, j], np.sqrt(np.diagonal(inverse @ cov @ inverse.T))
+        return pseudo_inverse(between) @ self.y[i, j], np.sqrt(np.diagonal(inverse @ cov @ inverse.T))
 
     def agreeing(self, limit: float) -> np.ndarray:
         """Which attitudes (n,) agree with the best guess: the one of largest likelihood, with distances cut at `limit`; when
@@ -132,7 +133,7 @@ class _Window:
         same = (m > 0.0).astype(float)
         walk = c1 + m**2 * c2 - 2.0 * m * same * np.minimum(c1, c2)
         walk = np.maximum(walk, 0.0) + (self.sigma_u**2 * tau**2 * np.maximum(np.abs(tau), s) / 3.0)[:, None]
-        M = (self.A - self.A[i]) @ np.linalg.inv(self.A[j] - self.A[i])
+        M = (self.A - self.A[i]) @ pseudo_inverse(self.A[j] - self.A[i])
         rest = np.eye(3) - M
         cov = self.S + rest @ self.S[i] @ np.swapaxes(rest, 1, 2) + M @ self.S[j] @ np.swapaxes(M, 1, 2)
         cov = cov + walk[:, :, None] * np.eye(3)
