@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .wahba import WahbaSolution, accept, threshold
+from .wahba import AMBIGUITY, WahbaSolution, accept, threshold
 
 Vector = tuple[Any, Any, Any]
 Matrix = tuple[Vector, Vector, Vector]
@@ -208,12 +208,14 @@ def observable(d: Directions, gap: Any = None) -> Any:
     gap: distance of K's two largest eigenvalues, for the solvers that need it.
     """
     limit = threshold(d.dtype)
-    # NaN compares as False. M's smallest eigenvalue is det over the sum of products of two, within a factor of two.
-    seen = None if gap is None else gap > limit
+    seen = None
     for v in (d.b, d.r):
+        # NaN compares as False. M's smallest eigenvalue is det over the sum of products of two, within a factor of two.
         _, det, second = information(d.w, v)
-        both = (det > limit * second) & (second > 0)
-        seen = both if seen is None else seen & both
+        here = (det > limit * second) & (second > 0)
+        if gap is not None:
+            here = here & (gap * second > 2.0 * AMBIGUITY * det)
+        seen = here if seen is None else seen & here
     return seen
 
 

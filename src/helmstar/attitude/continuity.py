@@ -96,7 +96,13 @@ def _accumulate(q: Any, xp: Any) -> Any:
     if xp is not np:
         from ..backend import jax
 
-        return jax.lax.associative_scan(lambda a, b: _multiply(b, a, xp), q, axis=q.ndim - 2)
+        def step(before: Any, one: Any) -> Any:
+            after = _multiply(one, before, xp)
+            return after, after
+
+        start = xp.zeros_like(q[..., 0, :]).at[..., 3].set(1.0)
+        _, rows = jax.lax.scan(step, start, xp.moveaxis(q, -2, 0))
+        return xp.moveaxis(rows, 0, -2)
     out = np.array(q, copy=True)
     for k in range(1, q.shape[-2]):
         out[..., k, :] = _multiply(q[..., k, :], out[..., k - 1, :], xp)

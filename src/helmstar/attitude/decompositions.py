@@ -13,6 +13,8 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
+import numpy as np
+
 from .wahba import WahbaSolution, finish, namespace, prepare, quaternion_of_matrix
 
 
@@ -28,6 +30,7 @@ def _sum(share: Any, xp: ModuleType) -> Any:
     return xp.where(total > 0, total, xp.ones_like(total))
 
 
+@np.errstate(all="ignore")
 def davenport(b: Any, r: Any, sigma: Any = None, mask: Any = None, weights: Any = None) -> WahbaSolution:
     """Davenport's q-method.
 
@@ -51,6 +54,7 @@ def davenport(b: Any, r: Any, sigma: Any = None, mask: Any = None, weights: Any 
     return finish(q, b, r, a, (values[..., -1] - values[..., -2]) / _sum(share, xp), xp)
 
 
+@np.errstate(all="ignore")
 def svd(b: Any, r: Any, sigma: Any = None, mask: Any = None, weights: Any = None) -> WahbaSolution:
     """Markley's SVD method; arguments as for `davenport`."""
     xp = namespace(b, r, sigma, mask, weights)

@@ -23,7 +23,7 @@ from .wahba import WahbaSolution
 
 
 def esoq(b: Any, r: Any, sigma: Any = None, mask: Any = None, weights: Any = None) -> WahbaSolution:
-    """ESOQ, polished by one Newton step on the loss. Arguments as for `davenport`."""
+    """ESOQ, polished by Newton on the loss. Arguments as for `davenport`."""
     return run(_esoq, b, r, sigma, mask, weights)
 
 
@@ -57,7 +57,7 @@ def _esoq(d: c.Directions) -> WahbaSolution:
 
 
 def esoq2(b: Any, r: Any, sigma: Any = None, mask: Any = None, weights: Any = None) -> WahbaSolution:
-    """ESOQ2 with a turned reference, polished by one Newton step on the loss. Arguments as for `davenport`."""
+    """ESOQ2 with a turned reference, polished by Newton on the loss. Arguments as for `davenport`."""
     return run(_esoq2, b, r, sigma, mask, weights)
 
 

@@ -29,7 +29,7 @@ from .wahba import WahbaSolution
 
 
 def quest(b: Any, r: Any, sigma: Any = None, mask: Any = None, weights: Any = None) -> WahbaSolution:
-    """QUEST with sequential rotations, polished by one Newton step on the loss; the closed form where n is two.
+    """QUEST with sequential rotations, polished by Newton on the loss; the closed form where n is two.
 
     Arguments as for `davenport`.
     """
@@ -72,18 +72,24 @@ def _two(d: c.Directions) -> WahbaSolution:
     if len(d.b) != 2:
         raise ValueError(f"n {len(d.b)}: must be 2 for quest_two; quest takes any number")
     xp = d.xp
-    normal_b, cos_b, sin_b = _pair(d.b, xp)
-    normal_r, cos_r, sin_r = _pair(d.r, xp)
+    q = optimum_of_two(d)
+    return c.conclude(d, c.only(c.observable(d), q, xp))
+
+
+def optimum_of_two(d: c.Directions) -> c.Quaternion:
+    """q_BN of Wahba's optimum for two directions."""
+    xp = d.xp
+    normal_b, cos_b, sin_b = plane(d.b, xp)
+    normal_r, cos_r, sin_r = plane(d.r, xp)
     y = d.w[1] * (sin_b * cos_r - cos_b * sin_r)
     x = d.w[0] + d.w[1] * (cos_b * cos_r + sin_b * sin_r)
     lam = xp.sqrt(x * x + y * y)
     x, y = x / lam, y / lam
     first = c.add(c.scale(x, d.b[0]), c.scale(y, c.cross(normal_b, d.b[0])))
-    q = c.quaternion_of_rows(c.triads(normal_b, first, normal_r, d.r[0]), xp)
-    return c.conclude(d, c.only(c.observable(d), q, xp))
+    return c.quaternion_of_rows(c.triads(normal_b, first, normal_r, d.r[0]), xp)
 
 
-def _pair(v: list[c.Vector], xp: Any) -> tuple[c.Vector, Any, Any]:
+def plane(v: list[c.Vector], xp: Any) -> tuple[c.Vector, Any, Any]:
     """Unit normal of two directions, cosine and sine of their separation."""
     n = c.cross(v[0], v[1])
     sine = xp.sqrt(c.dot(n, n))

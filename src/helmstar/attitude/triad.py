@@ -6,8 +6,8 @@ Its covariance is its own (Shuster and Oh 1981, eq. (92)), with W the unit direc
     P = s1^2 I + [(s2^2 - s1^2) W1 W1^T + s1^2 (W1 . W2) (W1 W2^T + W2 W1^T)] / |W1 x W2|^2.
 
 Optimized TRIAD (Bar-Itzhack and Harman 1997): the mean of the two TRIADs, weighted with 1/s1^2 and 1/s2^2, orthogonalised.
-Both share the normal of the plane, so the projection onto the rotations is a normalisation in the plane, done exactly here.
-To first order it is Wahba's optimum for two directions, with its covariance.
+Both TRIADs share the normal of the plane, so the projection onto the rotations is a normalisation within the plane. Done
+exactly, instead of by the paper's one iteration, it is Wahba's optimum of the two directions, with its covariance.
 
 Of more than two directions the most accurate is the first, and the second is the one that leaves the least variance
 (s1^2 + s2^2) / sin^2; in a tie the one that comes first. The loss counts all directions.
@@ -19,6 +19,7 @@ from typing import Any
 
 from . import components as c
 from .blocks import run
+from .quest import optimum_of_two, plane
 from .wahba import WahbaSolution
 
 
@@ -34,7 +35,7 @@ def triad_optimised(b: Any, r: Any, sigma: Any = None, mask: Any = None, weights
 
 def _triad(d: c.Directions) -> WahbaSolution:
     xp, u = d.xp, _best_two(d)
-    normal_b, normal_r = _normal(u.b, xp), _normal(u.r, xp)
+    normal_b, normal_r = plane(u.b, xp)[0], plane(u.r, xp)[0]
     q = c.quaternion_of_rows(c.triads(normal_b, u.b[0], normal_r, u.r[0]), xp)
     W1, W2 = u.b
     n = c.cross(W1, W2)
@@ -44,29 +45,19 @@ def _triad(d: c.Directions) -> WahbaSolution:
     P = [[along * W1[j] * W1[k] + across * (W1[j] * W2[k] + W2[j] * W1[k]) for k in range(3)] for j in range(3)]
     for j in range(3):
         P[j][j] = P[j][j] + s1
-    q = c.only(c.observable(u), q, xp)
+    q = c.only(_seen(d, u), q, xp)
     return c.conclude(d, q, covariance=(tuple(P[0]), tuple(P[1]), tuple(P[2])))  # type: ignore[arg-type]
 
 
 def _triad_optimised(d: c.Directions) -> WahbaSolution:
-    xp, u = d.xp, _best_two(d)
-    normal_b, normal_r = _normal(u.b, xp), _normal(u.r, xp)
-    across_b, across_r = c.cross(normal_b, u.b[0]), c.cross(normal_r, u.r[0])
-    # Where the TRIAD of the second direction puts the first one: its components along and across the first.
-    cos_b, sin_b = c.dot(u.b[0], u.b[1]), c.dot(across_b, u.b[1])
-    cos_r, sin_r = c.dot(u.r[0], u.r[1]), c.dot(across_r, u.r[1])
-    x = u.w[0] + u.w[1] * (cos_b * cos_r + sin_b * sin_r)
-    y = u.w[1] * (sin_b * cos_r - cos_b * sin_r)
-    norm = 1.0 / xp.sqrt(x * x + y * y)
-    first = c.add(c.scale(x * norm, u.b[0]), c.scale(y * norm, across_b))
-    q = c.quaternion_of_rows(c.triads(normal_b, first, normal_r, u.r[0]), xp)
-    return c.conclude(d, c.only(c.observable(u), q, xp), used=u)
+    u = _best_two(d)
+    return c.conclude(d, c.only(_seen(d, u), optimum_of_two(u), d.xp), used=u)
 
 
-def _normal(v: list[c.Vector], xp: Any) -> c.Vector:
-    """Unit normal of two directions."""
-    n = c.cross(v[0], v[1])
-    return c.scale(1.0 / xp.sqrt(c.dot(n, n)), n)
+def _seen(d: c.Directions, u: c.Directions) -> Any:
+    """Whether the two directions fix the attitude; a NaN among the others counts, as for every solver."""
+    squares = c.total([c.dot(b, b) + c.dot(r, r) for b, r in zip(d.b, d.r, strict=True)])
+    return c.observable(u) & (squares > 0)
 
 
 def _best_two(d: c.Directions) -> c.Directions:

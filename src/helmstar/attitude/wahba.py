@@ -21,6 +21,10 @@ import numpy as np
 OBSERVABLE_SINE = 1e-6
 """Directions within this angle (rad) of one line leave the turn about it unknown, in float64."""
 
+AMBIGUITY = 1e-3
+"""Least curvature of the loss at its minimum over what the covariance says it is. They are equal for directions that agree;
+where b and r contradict each other, as in a mirror image, the curvature vanishes, and many attitudes fit equally well."""
+
 
 class WahbaSolution(NamedTuple):
     """q_BN (..., 4) scalar last; covariance (..., 3, 3) of the error on the left, rad^2 in B; loss (...,), half a
@@ -129,12 +133,12 @@ def finish(q: Any, b: Any, r: Any, a: Any, gap: Any, xp: ModuleType) -> WahbaSol
     limit = xp.asarray(threshold(b.dtype), dtype=b.dtype)
     # The fitted directions have the angles of r; b must have two that differ as well.
     _, det_b, second_b = _cofactors(a, b, total, xp)
-    observable = xp.isfinite(loss) & xp.isfinite(det) & (gap > limit)
+    observable = xp.isfinite(loss) & xp.isfinite(det)
     for d, s in ((det, second), (det_b, second_b)):
         # M's middle eigenvalue is at least half its trace's excess, so its smallest one, which says whether the turn about
         # the common line is known, is det / (sum of products of two).
         smallest = d / xp.where(s > 0, s, xp.ones_like(s))
-        observable = observable & (s > 0) & (smallest > limit * total)
+        observable = observable & (s > 0) & (smallest > limit * total) & (gap * total > 2.0 * AMBIGUITY * smallest)
     safe = xp.where(observable, det, xp.ones_like(det))
     nan = xp.asarray(xp.nan, dtype=b.dtype)
     covariance = xp.where(observable[..., None, None], c / safe[..., None, None], nan)
