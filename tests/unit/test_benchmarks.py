@@ -30,3 +30,30 @@ def test_c_and_helmstar_agree(monkeypatch):
     assert 4.0 < nis_c.mean() < 8.0
     for name in ("problem", "compiled_c", "mekf"):
         sys.modules.pop(name, None)
+
+
+def test_the_wahba_benchmark_tells_good_from_bad(monkeypatch):
+    """Small: it runs, the figures are those of the solvers, and the pitfall and the references stand apart from them."""
+    pytest.importorskip("mpmath")
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import wahba
+
+    from helmstar.attitude import SOLVERS
+
+    for name in ("problem", "wahba"):
+        assert Path(sys.modules[name].__file__ or "").parent == BENCHMARKS
+    digits = wahba.accuracy(list(SOLVERS), count=50, references=3)
+    assert set(SOLVERS) <= set(digits)
+    for name in SOLVERS:
+        assert digits[name]["random"]["truth_max"] < 1e-11
+        assert digits[name]["180 deg"]["truth_max"] < 1e-11
+    for name in ("quest", "foam", "esoq", "esoq2", "quest_two"):
+        assert digits[name]["close"]["truth_max"] < 1e-9
+        assert digits[name]["close"]["optimum_max"] < 1e-9
+    assert 1e-9 < digits["davenport"]["close"]["truth_median"] < 1e-4
+    assert digits["naive ESOQ2"]["random"]["truth_max"] > 1
+    assert digits["scipy align_vectors"]["random"]["optimum_max"] < 1e-11
+    speed = wahba.timings(["quest_two", "svd"], count=64, loops=2, jax_too=False)
+    assert {"quest_two", "svd", "naive ESOQ2", "scipy align_vectors"} <= set(speed)
+    for name in ("problem", "wahba"):
+        sys.modules.pop(name, None)
