@@ -127,6 +127,13 @@ def test_wraps_are_undone_where_they_are_known_and_lost_increments_elsewhere(tmp
     np.testing.assert_allclose(lost.value, whole.value[shared], atol=1e-10)
 
 
+def test_nothing_but_jumps_is_a_data_error(tmp_path):
+    rows = files.imu_rows(0.375, np.zeros(3))
+    jumping = [" ".join([*r.split()[:5], str(1e4 * i), "0"]) for i, r in enumerate(rows)]
+    with pytest.raises(DataError, match=r"no increment is left; for one, .*FiltAng jumps"):
+        read(files.write(tmp_path / "IMU1B_x_C_04.txt", "IMU1B", jumping))
+
+
 def test_header_says_the_order_of_columns(tmp_path):
     order = ["gps_time", "qualflg", "quatkcoeff", "quatjcoeff", "quaticoeff", "quatangle", "qual_rss", "GRACEFO_id"]
     cells = [line.split() for line in FLIGHT.splitlines()]
@@ -148,6 +155,10 @@ def test_without_a_list_of_variables_the_documented_layout_holds(tmp_path):
     by_parts = read(imu).gyro
     imu.write_text(f"header:\n# End of YAML header\n{short}\n")
     np.testing.assert_allclose(read(imu).gyro.value, by_parts.value, atol=1e-9)  # seconds of 9 digits hold 1e-7 s
+    without = [name for name in files.VARIABLES["SCA1B"] if name != "quatjcoeff"]
+    rows = [" ".join(np.delete(line.split(), 5)) for line in FLIGHT.splitlines()]
+    with pytest.raises(DataError, match=r"without quatjcoeff"):
+        read(files.write(tmp_path / "SCA1B_y_C_04.txt", "SCA1B", rows, variables=without))
     nameless = path.rename(tmp_path / "x.txt")
     with pytest.raises(DataError, match=r"x\.txt: the header has no list of variables"):
         read(nameless)

@@ -97,6 +97,7 @@ def test_known_by_content_not_by_name(tmp_path):
         ({"q": "0 0 1"}, "no attitude in it; for one, .*row 16: the record has not 5 numbers"),
         ({"q": "0 0 0 zero"}, "no attitude in it; for one, .*row 16: .*no number"),
         ({"q": "0 0 0 nan"}, "none of its 3 rows is usable"),
+        ({"q": "0 0 0 0"}, "none of its 3 rows is usable.*length 0, not 1"),
     ],
 )
 def test_what_cannot_be_read_is_said(tmp_path, keys, message):

@@ -172,7 +172,7 @@ def _unit_length(
     table: Table, what: str, values: np.ndarray, good: np.ndarray, log: ProblemLog
 ) -> tuple[np.ndarray, np.ndarray]:
     """The values made unit vectors, and which rows stay."""
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         norm = np.linalg.norm(values, axis=1)
         off = np.abs(norm - 1.0)
         damaged = good & ~(off <= NORM_TOLERANCE)

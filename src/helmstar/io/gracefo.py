@@ -75,10 +75,10 @@ def read_gracefo(path: Path, settings: GraceFoConfiguration, log: ProblemLog) ->
         from .gracefo_imu import imu_part
 
         return imu_part(product, settings, log)
-    if "quatangle" not in columns:
+    if missing := [name for name in _QUATERNION if name not in columns]:
         raise DataError(
-            f"{path}: a GRACE-FO file with columns {', '.join(columns)[:200]}; of these SCA1A, SCA1B, IMU1A and IMU1B are "
-            "read, which have quatangle .. or FiltAng"
+            f"{path}: a GRACE-FO file with columns {', '.join(columns)[:200]}, without {', '.join(missing)}; of these "
+            "products SCA1A, SCA1B, IMU1A and IMU1B are read, which have quatangle, quaticoeff .. or FiltAng"
         )
     return _sca_part(product, settings, log)
 
@@ -258,7 +258,8 @@ def _sca_part(product: Product, settings: GraceFoConfiguration, log: ProblemLog)
     q = np.stack([numbers[i].value for i in (1, 2, 3, 0)], axis=1)
     if "sca_desig" in table.columns or "nlocks" in table.columns:  # SCA1A: one camera's frame
         stays, mounting = _one_camera(product, stays, settings, log)
-        q = _hamilton(q, mounting)
+        with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is noted below
+            q = _hamilton(q, mounting)
     q_BN = conjugate(q) if settings.quaternion_sense == "nb" else q
     chosen = np.flatnonzero(stays)
     samples = AttitudeSamples(

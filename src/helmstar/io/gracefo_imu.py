@@ -105,6 +105,8 @@ def imu_part(product: Product, settings: GraceFoConfiguration, log: ProblemLog) 
     value = np.diff(counted[kept], axis=0) @ np.linalg.pinv(chosen).T
     losses = np.cumsum(lost)[kept]
     whole = np.flatnonzero(losses[1:] == losses[:-1])
+    if not len(whole):
+        raise DataError(f"{file}: no increment is left{for_one(log.problems())}")
     rows = index[kept[1:]]
     layout = replace(attitude_layout("rcvtime", "gps"), gyro=("FiltAng",) * 3, gyro_unit="rad", quaternion=())
     group = Group(whole, value[whole], np.diff(at[kept])[whole])
