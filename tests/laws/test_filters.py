@@ -1394,9 +1394,17 @@ def attitude_input(v):
     return GyroInput(v, jnp.zeros((3, 3)))
 
 
+def commanded_input(v):
+    """A rate that is not the gyro's: the drift has no part in it."""
+    return GyroInput(v, jnp.zeros((3, 3)), jnp.asarray(0.0))
+
+
 PROCESSES = {
     "attitude so3_left": (attitude_model(N_GYRO, so3_left), attitude_input, False),
     "drift so3_left": (attitude_drift_model(N_GYRO, so3_left), attitude_input, True),
+    "drift so3_right": (attitude_drift_model(N_GYRO, so3_right), attitude_input, True),
+    "commanded so3_left": (attitude_drift_model(N_GYRO, so3_left), commanded_input, True),
+    "commanded so3_right": (attitude_drift_model(N_GYRO, so3_right), commanded_input, True),
     **{
         f"xu2020 {r.name}": (xu2020.lie_model(1e-4, 1e-3, r), lambda v: v, False)
         for r in (so3_right, so3_left, gibbs_left)
@@ -1404,7 +1412,7 @@ PROCESSES = {
 }
 SENSORS = {
     **{f"stars {r.name}": (star_directions(1e-3, r), r) for r in (so3_left, gibbs_left, so3_right)},
-    **{f"unit {r.name}": (unit_star_directions(1e-3, r), r) for r in (so3_left, gibbs_left)},
+    **{f"unit {r.name}": (unit_star_directions(1e-3, r), r) for r in (so3_left, gibbs_left, so3_right)},
     "whole so3_left": (whole_attitude(so3_left), so3_left),
 }
 

@@ -16,6 +16,7 @@ import xarray as xr
 
 from .. import __version__
 from ..errors import CampaignError, ConfigurationError
+from ..files import replacing
 from ..progress import Progress
 from ..scenarios.experiment import Experiment
 from ..versions import versions
@@ -132,9 +133,8 @@ def run_campaign(
     metrics = experiment.summarise(dataset)
     wall = time.perf_counter() - begin
     dataset.attrs["wall_s"] = wall
-    part = folder / "results.nc.part"
-    dataset.to_netcdf(part, engine="h5netcdf")
-    os.replace(part, folder / "results.nc")
+    with replacing(folder / "results.nc") as part:
+        dataset.to_netcdf(part, engine="h5netcdf")
     summary = {
         "scenario": experiment.name,
         "seed": seed,

@@ -17,7 +17,8 @@ def recursive_bound(F: np.ndarray, Q: np.ndarray, information: np.ndarray, P0: n
     """Bound (steps, ..., n, n) after each update.
 
     F, Q, information = H^T R^-1 H: (steps, ..., n, n) or (n, n), at the truth; P0 (..., n, n) before the first step,
-    singular allowed. Axes between are batch axes. Raises ValueError for infinite information: a noiseless sensor has no bound but zero where it sees.
+    singular allowed. Axes between are batch axes.
+    Raises ValueError for infinite information: a noiseless sensor has no bound but zero where it sees.
     """
     if np.any(np.isinf(information)):
         raise ValueError("infinite information: a noiseless sensor has no bound but zero where it sees")

@@ -12,6 +12,7 @@ The torque that makes a prescribed rate a solution is N = J dw/dt + w x J w.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Literal, NamedTuple, get_args
 
@@ -62,7 +63,7 @@ def simulate(
     """Attitude at the given times, driven by a prescribed rate(t), or by Euler's equations from rate0 under torque(t).
 
     Integrated with scipy's DOP853 at 1e-13 relative. Raises ValueError when neither or both ways are given, for another
-    law, for times that are not two or more and increasing, or when the integrator fails.
+    law, for times that are not two or more and increasing, for a rate or torque that is not finite, or when the integrator fails.
     """
     from scipy.integrate import solve_ivp
 
@@ -82,6 +83,8 @@ def simulate(
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
         q, w = y[:4], (y[4:] if euler else rate_of(t))
         dq = _half_product(q, w, 1.0) if law == "printed" else _half_product(q, -w, -1.0)
+        if not math.isfinite(sum(dq)):  # the integrator would search for a step for ever
+            raise ValueError(f"the rate or the torque is not finite at t = {t} s")
         if not euler:
             return np.array(dq)
         return np.array([*dq, *(J_inverse @ (torque_at(t) - np.cross(w, J @ w)))])
@@ -92,7 +95,7 @@ def simulate(
         derivative, (time[0], time[-1]), y0, method="DOP853", t_eval=time, rtol=1e-13, atol=1e-15, max_step=20 * step
     )
     if not s.success:
-        raise ValueError(f"the integrator stopped at t = {s.t[-1] if s.t.size else time[0]} s: {s.message}")
+        raise ValueError(f"the integrator stopped at t = {s.t[-1] if len(s.t) else time[0]} s: {s.message}")
     q = s.y[:4].T / np.linalg.norm(s.y[:4].T, axis=1, keepdims=True)
     w = s.y[4:].T if euler else np.array([rate_of(t) for t in time])
     return RigidBodyTruth(time, w, q, _increments(q, law))

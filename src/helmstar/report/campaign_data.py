@@ -98,6 +98,11 @@ class Campaign:
         return int(self.attrs.get("requested_runs", self.runs))
 
     @property
+    def nees_dof(self) -> int:
+        """Degrees of freedom of NEES."""
+        return int(self.attrs.get("nees_dof", 3))
+
+    @property
     def times(self) -> int:
         """Updates per run."""
         return len(self.update)

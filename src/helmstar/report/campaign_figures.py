@@ -8,7 +8,6 @@ import numpy as np
 
 from . import figures, style
 from .campaign_data import SINGLE_POINTS, Campaign
-from .campaign_table import NEES_DEGREES
 from .encode import extremes
 from .numbers import (
     chi_square_band,
@@ -22,7 +21,7 @@ from .page import Figure, Page, number
 
 GROUP = "estimator"
 WITHIN = 0.9973  # probability of 3 sigma
-PREFERRED = ("lie_tuned", "lie")
+PREFERRED = ("lie_tuned", "lie", "quest_ekf")
 
 
 def add_paper_figures(page: Page, campaign: Campaign) -> None:
@@ -153,16 +152,17 @@ def add_consistency(page: Page, campaign: Campaign) -> None:
             continue
         with np.errstate(invalid="ignore", divide="ignore"):
             nis = np.where(dof > 0, nis / dof, np.nan)
-        nees = nees / NEES_DEGREES
-        limits = _inside(nees, nees_count * NEES_DEGREES)
+        nees = nees / campaign.nees_dof
+        limits = _inside(nees, nees_count * campaign.nees_dof)
         index = extremes(np.stack([nees, nis]), SINGLE_POINTS)
         figure = figures.consistency(
             campaign.update[index],
             nees[index],
-            chi_square_band(nees_count[index] * NEES_DEGREES),
+            chi_square_band(nees_count[index] * campaign.nees_dof),
             nis[index],
             chi_square_band(dof_sum[index]),
             name,
+            campaign.nees_dof,
         )
         shares = [("NEES", limits), ("NIS", _inside(nis, dof_sum))]
         said = [f"{what} lies inside its band at {share:.0%} of the updates" for what, share in shares if share >= 0]

@@ -147,6 +147,7 @@ def consistency(
     nis: np.ndarray,
     nis_band: tuple[np.ndarray, np.ndarray],
     name: str,
+    nees_dof: int = 3,
 ) -> FigureDict:
     """NEES and NIS averaged over runs, both divided by their degrees of freedom, so that 1 is right."""
     colour = estimator_style(name)[0]
@@ -157,7 +158,7 @@ def consistency(
         positive = np.where(values > 0.0, values, np.nan)
         hover = "update %{x}<br>%{y:.4g}"
         traces.append(line(update, positive, "mean over runs", colour, width=1.3, hover=hover, **place))
-    axes = stacked(2, ["NEES / 3", "NIS / dof"], UPDATE, gap=0.08)
+    axes = stacked(2, [f"NEES / {nees_dof}", "NIS / dof"], UPDATE, gap=0.08)
     linear, log = {}, {}
     for key, values, limits in (("yaxis", nees, nees_band), ("yaxis2", nis, nis_band)):
         most = style.nice_limit(limits[1], factor=1.8) or 2.0

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import campaign_figures as parts
+from . import zhou2021
 from .campaign_data import Campaign
 from .campaign_table import add_summary_table, headline
 from .claims import Claim, add_claims
@@ -39,10 +40,11 @@ def monte_carlo_page(dataset: xarray.Dataset, summary: dict[str, Any], claims: S
     runs = f"{campaign.runs} run{'s' if campaign.runs != 1 else ''}"
     page = Page(
         str(campaign.attrs.get("title") or campaign.scenario),
-        subtitle=f"Scenario `{campaign.scenario}`, {runs} of {campaign.times} updates, seed {campaign.seed}",
+        subtitle=f"Scenario `{campaign.scenario}`, {runs} of {int(campaign.update[-1])} updates, seed {campaign.seed}",
     )
     page.section("Result")
-    page.headline(*headline(campaign))
+    orbit = campaign.attrs.get("experiment") == "zhou2021"
+    page.headline(*(zhou2021.headline(summary) if orbit else headline(campaign)))
     if campaign.runs < campaign.requested:
         page.notice(
             f"The campaign was interrupted: {campaign.runs} of {campaign.requested} runs are finished. Every figure "
@@ -55,6 +57,13 @@ def monte_carlo_page(dataset: xarray.Dataset, summary: dict[str, Any], claims: S
     if claims:
         page.section("The paper's claims", short="Claims")
         add_claims(page, claims)
+    if orbit:
+        zhou2021.add_sections(page, dataset, campaign)
+        if campaign.runs:
+            parts.add_consistency(page, campaign)
+            parts.add_bound_and_time(page, campaign)
+        _add_origin(page, campaign)
+        return page
     page.section("Summary of all estimators", short="Summary")
     add_summary_table(page, campaign)
     add_paired(page, campaign)

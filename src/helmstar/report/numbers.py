@@ -99,13 +99,3 @@ def euler_difference_deg(truth_q: np.ndarray, error: np.ndarray) -> np.ndarray:
     estimate = truth @ rotation_from_vector(-error)
     difference = tait_bryan_deg(estimate) - tait_bryan_deg(truth)
     return -((-difference + 180.0) % 360.0 - 180.0)
-
-
-def continuous_quaternion(q: np.ndarray) -> np.ndarray:
-    """Quaternions (n, 4) with signs chosen so that neighbours lie close together; rows of NaN are passed over."""
-    result = np.array(q, dtype=float)
-    good = np.flatnonzero(np.isfinite(result).all(axis=1))
-    dots = np.sum(result[good[1:]] * result[good[:-1]], axis=1)
-    signs = np.concatenate([[1.0], np.cumprod(np.where(dots < 0.0, -1.0, 1.0))]) if good.size else np.ones(0)
-    result[good] *= signs[:, None]
-    return result

@@ -14,9 +14,7 @@ Text is plain text, escaped here; `backticks` mark code. A figure is a dict of p
 from __future__ import annotations
 
 import importlib.util
-import os
 import re
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -27,6 +25,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..errors import HelmstarError
+from ..files import write_atomically
 from .encode import ArrayPool, pack, script_json
 
 ChipKind = Literal["good", "bad", "part", "plain"]
@@ -198,18 +197,7 @@ class Page:
         """Write the page; a reader sees the old file or the whole new one, never a part."""
         target = Path(path)
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(prefix=f".{target.name}.", dir=target.parent)
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as stream:
-                stream.write(self.html())
-            mask = os.umask(0)
-            os.umask(mask)
-            os.chmod(temporary, 0o666 & ~mask)  # mkstemp makes files that only their owner may read
-            os.replace(temporary, target)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
-        return target
+        return write_atomically(target, self.html())
 
     def _figure(self, item: Figure) -> str:
         variants, first = item.variants(), item.first()

@@ -26,6 +26,16 @@ _ESTIMATORS = {
     "ukf": (VIOLET, "cross-open"),
     "static_svd": (GREY, "x"),
     "lie_printed": (AMBER, "pentagon-open"),
+    "quest_ekf": (BLUE, "circle-open"),
+    "quest_ekf_isotropic": (RED, "triangle-down-open"),
+    "quest_ekf_unsigned": (AMBER, "x"),
+    "mekf_reset": (SKY, "star-open"),
+    "iekf": (ORANGE, "square-open"),
+    "usque": (VIOLET, "cross-open"),
+    "mekf_adaptive": (PINK, "triangle-up-open"),
+    "mekf_rate_state": (GREY, "hexagon-open"),
+    "predictive": (AMBER, "pentagon-open"),
+    "smoother": (GREEN, "star"),
 }
 _OTHERS = [(SKY, "circle"), (ORANGE, "square"), (GREEN, "diamond"), (PINK, "triangle-up"), (VIOLET, "triangle-down")]
 TUNED = "_tuned"

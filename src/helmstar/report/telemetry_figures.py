@@ -176,11 +176,11 @@ def nis(updates: Any, clock: Clock, shapes: list[dict[str, Any]], gate: np.ndarr
 
 def attitude(frames: Mapping[str, Any], clock: Clock, shapes: list[dict[str, Any]]) -> dict[str, Any]:
     """The attitude as a quaternion whose signs are continuous; q and -q are the same attitude."""
-    from .numbers import continuous_quaternion
+    from ..attitude import continuous
 
     kind = "smoothed" if "smoothed" in frames else "filtered"
     table = frames[kind]
-    q = continuous_quaternion(np.stack([_column(table, f"q_bn_{name}") for name in "xyzw"], axis=1))
+    q = continuous(np.stack([_column(table, f"q_bn_{name}") for name in "xyzw"], axis=1))
     index = extremes(q.T, 2 * SMOOTH)
     time = clock(_column(table, "time_s"))[index]
     colours = (*style.AXIS_COLOURS, style.GREY)

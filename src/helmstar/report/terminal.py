@@ -10,7 +10,9 @@ def _number(x: float | None, digits: int = 3) -> str:
 
 
 def print_campaign(summary: dict[str, Any]) -> None:
-    """One line for each estimator, at most 80 columns."""
+    """One line for each estimator, at most 88 columns."""
+    if any("drift_rms_deg_h" in m for m in summary["estimators"].values()):
+        return _print_attitude_and_drift(summary)
     runs = summary["runs"]
     last = list(next(iter(summary["estimators"].values()))["median_error_deg"])[-1]
     print(f"{summary['scenario']}: {runs} runs, seed {summary['seed']}, {summary['wall_s']:.1f} s")
@@ -33,6 +35,35 @@ def print_campaign(summary: dict[str, Any]) -> None:
     print(f"median deg: total error at update {last}; by: update from which all runs stay below 1 deg;")
     print("NEES/3: 1 when consistent; / bound: largest RMS over the Cramer-Rao bound;")
     print("both over updates 200 to 600")
+
+
+def _print_attitude_and_drift(summary: dict[str, Any]) -> None:
+    runs = summary["runs"]
+    print(f"{summary['scenario']}: {runs} runs, seed {summary['seed']}, {summary['wall_s']:.1f} s")
+    heads = ("estimator", "attitude deg", "drift deg/h", "NEES/6", "signs", "loss: mean held", "179 deg off")
+    widths = (22, 14, 13, 8, 7, 17, 13)
+    print(
+        "".join(
+            h.ljust(w) if i == 0 else h.rjust(w) for i, (h, w) in enumerate(zip(heads, widths, strict=True))
+        ).rstrip()
+    )
+    for name, m in summary["estimators"].items():
+        attitude, drift = ([v for v in m[k] if v is not None] for k in ("attitude_rms_deg", "drift_rms_deg_h"))
+        case = m["recovery_s"].get("start_179deg") or {}
+        row = (
+            name,
+            _number(max(attitude, default=None)),
+            _number(max(drift, default=None)),
+            _number(None if m["nees_mean"] is None else m["nees_mean"] / 6.0),
+            str(m["sign_errors"]),
+            _number(m["outage_peak_deg"].get("hold_mean")),
+            f"{case['converged']}/{case['runs']}" if case and name != "smoother" else "-",
+        )
+        print("".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))))
+    print("attitude, drift: RMS of the last 1000 s, worst axis; NEES/6: 1 when consistent; signs: updates with the")
+    print(
+        "wrong sign; loss: median peak error, gyro lost for a minute; 179 deg off: runs that recover from such a start"
+    )
 
 
 def print_attitude(result: dict[str, Any]) -> None:

@@ -18,10 +18,14 @@ from ..configuration import explain, read_toml
 from ..errors import ConfigurationError
 
 
+DEEPEST = 8
+"""More dots than any key of a scenario has."""
+
+
 class ScenarioSpecification(BaseModel):
     """The keys that all scenarios share."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
     experiment: str
     title: str
@@ -38,18 +42,38 @@ def library() -> dict[str, str]:
 
 
 def parse_set(assignments: Iterable[str]) -> dict[str, Any]:
-    """`["star.sigma_arcsec=20"]` -> {"star.sigma_arcsec": 20}; values are TOML, a bare word is a string."""
+    """`["star.sigma_arcsec=20"]` -> {"star.sigma_arcsec": 20}; values are TOML, a bare word is a string.
+
+    Raises ConfigurationError for what is not one KEY=VALUE, and for a key given twice or inside another that is given.
+    """
     out: dict[str, Any] = {}
     for text in assignments:
         key, equals, value = text.partition("=")
         key = key.strip()
         if not equals or not key:
             raise ConfigurationError(f"--set {text}: must be KEY=VALUE, such as --set star.sigma_arcsec=20")
+        if key.count(".") > DEEPEST:
+            raise ConfigurationError(f"--set {_cut(text)}: no key has that many dots")
+        same = next((k for k in out if f"{k}.".startswith(f"{key}.") or f"{key}.".startswith(f"{k}.")), None)
+        if same is not None:
+            what = f"{key} is given twice" if same == key else f"{same} and {key} set the same thing"
+            raise ConfigurationError(f"--set {_cut(text)}: {what}; give one of them")
         try:
-            out[key] = tomllib.loads(f"v = {value}")["v"]
+            found = tomllib.loads(f"v = {value}")
         except tomllib.TOMLDecodeError:
-            out[key] = value.strip()
+            found = {"v": value.strip()}
+        except (ValueError, RecursionError) as error:  # thousands of digits or brackets
+            raise ConfigurationError(f"--set {_cut(text)}: cannot be read: {error}") from None
+        if found.keys() != {"v"}:
+            raise ConfigurationError(f"--set {_cut(text)}: must be one KEY=VALUE; give --set once for each key")
+        out[key] = found["v"]
     return out
+
+
+def _cut(text: str) -> str:
+    """On one line, at most 60 characters."""
+    shown = text.encode("unicode_escape").decode() if not text.isprintable() else text
+    return shown if len(shown) <= 60 else shown[:57] + "..."
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -83,9 +107,10 @@ def _content(scenario: str) -> tuple[str, str, dict[str, Any]]:
         raise ConfigurationError(f"scenario {scenario!r}: no such scenario; there are {names}, or give a .toml file")
     content = read_toml(path)
     experiment = content.get("experiment")
-    if experiment not in built_in:
+    if not isinstance(experiment, str) or experiment not in built_in:
+        given = repr(experiment) if isinstance(experiment, str) or experiment is None else "a value that is no text"
         raise ConfigurationError(
-            f"{path}: experiment = {experiment!r} is not allowed: must be one of {', '.join(map(repr, built_in))}"
+            f"{path}: experiment = {given} is not allowed: must be one of {', '.join(map(repr, built_in))}"
         )
     return path.stem, str(path), merge(tomllib.loads(built_in[experiment]), content)
 

@@ -29,12 +29,12 @@ from ..filters.static import turn_covariance
 from ..geometry import quaternion, small, so3, so3_left, so3_right
 from ..geometry.retraction import Retraction, gibbs_left, quaternion_additive
 from ..models import rigid_body, xu2020
+from ..units import ARCSEC
 from .experiment import Call, Variable
 from .xu2020_results import WINDOW
 from .xu2020_specification import Specification
 
 Array = jax.Array
-ARCSEC = np.pi / 180.0 / 3600.0
 SIGMA_FLOOR = 1e-10
 """Smallest sigma (rad) that a tuned filter is told: a noiseless sensor would make its covariance singular."""
 

@@ -5,25 +5,35 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from .specification import ScenarioSpecification
 
-Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+# Far wider than any use: only so that squares, products and quotients of the numbers stay finite.
+Finite = Annotated[float, Field(ge=-1e12, le=1e12, allow_inf_nan=False)]
+Positive = Annotated[float, Field(ge=1e-30, le=1e12, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False)]
+Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
+LEAST_STAR_ARCSEC = 1e-6
 
 
 class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class Truth(_Table):
     attitude: Annotated[list[Vector3], Field(min_length=3, max_length=3)]
-    rate_amplitude_rad_s: Annotated[float, Field(allow_inf_nan=False)]
+    rate_amplitude_rad_s: Finite
     rate_frequency_rad_s: Vector3
     rate: Literal["prescribed", "euler"]
-    inertia_kg_m2: Annotated[list[Positive], Field(min_length=3, max_length=3)]
+    inertia_kg_m2: Annotated[list[Annotated[float, Field(ge=1e-6, le=1e9, allow_inf_nan=False)]], Field(min_length=3, max_length=3)]
+
+    @field_validator("inertia_kg_m2")
+    @classmethod
+    def _is_of_a_body(cls, J: list[float]) -> list[float]:
+        if 2.0 * max(J) > sum(J) * (1.0 + 1e-9):
+            raise ValueError(f"{J} is not allowed: of no body is a moment of inertia larger than the other two together")
+        return J
 
     @field_validator("attitude")
     @classmethod
@@ -36,7 +46,14 @@ class Truth(_Table):
 
 class Star(_Table):
     directions: Annotated[list[Vector3], Field(min_length=2, max_length=2)]
-    sigma_arcsec: NonNegative
+    sigma_arcsec: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
+
+    @field_validator("sigma_arcsec")
+    @classmethod
+    def _is_none_or_some(cls, sigma: float) -> float:
+        if 0 < sigma < LEAST_STAR_ARCSEC:
+            raise ValueError(f"{sigma} is not allowed: must be 0 (no noise) or >= {LEAST_STAR_ARCSEC}")
+        return sigma
 
     @field_validator("directions")
     @classmethod
@@ -49,7 +66,7 @@ class Star(_Table):
 
 
 class Gyro(_Table):
-    sigma_rad_step: NonNegative
+    sigma_rad_step: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 
 
 class Start(_Table):
@@ -65,7 +82,7 @@ class TuningTable(_Table):
     quaternion_sigma_v: Positive
     ukf_alpha: Positive
     ukf_beta: NonNegative
-    ukf_kappa: Annotated[float, Field(gt=-3, allow_inf_nan=False)]
+    ukf_kappa: Annotated[float, Field(gt=-3, le=1e12, allow_inf_nan=False)]
 
 
 class Specification(ScenarioSpecification):
@@ -73,9 +90,26 @@ class Specification(ScenarioSpecification):
 
     experiment: Literal["xu2020"]
     updates: Annotated[int, Field(ge=1, le=1_000_000)]
-    step_s: Positive
+    step_s: Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
     truth: Truth
     star: Star
     gyro: Gyro
     start: Start = Start()
     tuning: TuningTable
+
+    @model_validator(mode="after")
+    def _steps_resolve_the_rate(self) -> Specification:
+        t = self.truth
+        turn = np.sqrt(3.0) * abs(t.rate_amplitude_rad_s) * self.step_s
+        if turn > np.pi:
+            raise ValueError(
+                f"truth.rate_amplitude_rad_s = {t.rate_amplitude_rad_s} with step_s = {self.step_s}: up to {turn:.3g} rad "
+                "in a step; must be at most half a turn, pi rad"
+            )
+        phase = max(map(abs, t.rate_frequency_rad_s)) * self.step_s
+        if phase > np.pi:
+            raise ValueError(
+                f"truth.rate_frequency_rad_s = {t.rate_frequency_rad_s} with step_s = {self.step_s}: {phase:.3g} rad in a "
+                "step; must be at most pi rad, two steps for each period"
+            )
+        return self

@@ -192,7 +192,7 @@ class Experiment:
 
     def fixed(self) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]]:
         """Truth, bound, and QUEST's quaternions of one example with and without (13)."""
-        from .zhou2021_results import example_quaternions, scenario_bound
+        from .zhou2021_results import design_table, example_quaternions, scenario_bound
 
         at = self.update
         bound = scenario_bound(self)
@@ -214,6 +214,7 @@ class Experiment:
                 np.sqrt(np.mean(np.diagonal(bound[-WINDOW_S:], axis1=1, axis2=2), axis=0)),
                 {"long_name": f"root mean square of the bound over the last {WINDOW_S} s", "units": "rad, rad/s"},
             ),
+            **{f"design_{k}": (("design",), v, {}) for k, v in design_table(self).items()},
         }  # fmt: skip
 
     def summarise(self, dataset: Any) -> dict[str, dict]:

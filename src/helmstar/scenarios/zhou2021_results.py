@@ -59,7 +59,7 @@ def summarise(dataset: Any) -> dict[str, dict]:
         # A policy that replaces the filter for the loss: what any filter with it would show.
         peak = out["mekf_rate_state"]["outage_peak_deg"].get("rate_state")
         for name, metrics in out.items():
-            if name not in OWN_POLICY and metrics["outage_peak_deg"]:
+            if name not in (*OWN_POLICY, "quest_ekf_unsigned") and metrics["outage_peak_deg"]:
                 metrics["outage_peak_deg"]["rate_state"] = peak
     return out
 
@@ -84,6 +84,8 @@ def _star_loss(d: Any) -> dict[str, float | None]:
 
 def _recoveries(d: Any) -> dict[str, dict]:
     """Of each case: median time until the error stays below the limit (None if half of the runs never do), how many do."""
+    if np.isnan(d["outage_peak_rad"].values).all():
+        return {}  # an estimator without branches: the smoother
     cases = [str(c) for c in d["case"].values]
     out = {}
     for i, case in enumerate(cases):
@@ -136,8 +138,8 @@ def scenario_bound(experiment: Experiment) -> np.ndarray:
     return bounds_of(experiment, *one, dark=experiment.timeline.dark[: experiment.timeline.main])[:, 0]
 
 
-def design_table(experiment: Experiment, last_s: int = 1000) -> list[dict[str, Any]]:
-    """One row for each reading and gyro: bound over the last seconds and Farrenkopf's steady state (worst axis), and whether
+def design_table(experiment: Experiment, last_s: int = 1000) -> dict[str, np.ndarray]:
+    """Columns over readings and gyros: bound over the last seconds and Farrenkopf's steady state (worst axis), and whether
     the paper's 0.003 deg and 0.03 deg/h are met at one sigma."""
     cells = [(reading, grade) for reading in READINGS for grade in GRADES]
     sigma = np.array([READINGS[reading] for reading, _ in cells])
@@ -148,22 +150,18 @@ def design_table(experiment: Experiment, last_s: int = 1000) -> list[dict[str, A
     # Of the worst axis of one epoch's solution, on average over the orbit.
     axis = np.sqrt(np.mean(np.diagonal(np.linalg.inv(information(experiment, 1.0)), axis1=1, axis2=2), axis=0).max())
     steady = farrenkopf(sigma * axis, sigma_v, sigma_u, 1.0)
-    out = []
-    for i, (reading, (arw, rrw)) in enumerate(cells):
-        attitude, drift = float(np.degrees(worst[i, 0])), float(worst[i, 1] / DEG_H)
-        out.append(
-            {
-                "reading": reading,
-                "arw": arw,
-                "rrw": rrw,
-                "attitude_deg": attitude,
-                "drift_deg_h": drift,
-                "farrenkopf_deg": float(np.degrees(steady.attitude[i])),
-                "farrenkopf_deg_h": float(steady.drift[i] / DEG_H),
-                "meets": (attitude <= CLAIMED_DEG, drift <= CLAIMED_DEG_H),
-            }
-        )
-    return out
+    attitude, drift = np.degrees(worst[:, 0]), worst[:, 1] / DEG_H
+    return {
+        "reading": np.array([reading for reading, _ in cells]),
+        "arw": np.array([grade[0] for _, grade in cells]),
+        "rrw": np.array([grade[1] for _, grade in cells]),
+        "attitude_deg": attitude,
+        "drift_deg_h": drift,
+        "farrenkopf_deg": np.degrees(steady.attitude),
+        "farrenkopf_deg_h": steady.drift / DEG_H,
+        "meets_attitude": attitude <= CLAIMED_DEG,
+        "meets_drift": drift <= CLAIMED_DEG_H,
+    }
 
 
 def example_quaternions(experiment: Experiment) -> tuple[np.ndarray, np.ndarray]:
@@ -271,8 +269,8 @@ def claims(experiment: Experiment, dataset: Any, summary: dict) -> list:
                 f"recovered within 300 s from a start 179 deg wrong: {counts}" if counts else "too short to tell",
                 "-",
                 "holds in part" if max(abs(r - 1.0) for r in ratio) < 0.05 else "measured",
-                "In accuracy, with the right R, they tie. QUEST in front gives robustness: its attitude needs no start. A filter on "
-                "star vectors that is restarted from QUEST when its innovations stay implausible (mekf_reset) has both.",
+                "In accuracy, with the right R, they tie. QUEST in front gives robustness: its attitude needs no start. A filter "
+                "on star vectors that is restarted from QUEST when its innovations stay implausible (mekf_reset) has both.",
             )
         )
     return out

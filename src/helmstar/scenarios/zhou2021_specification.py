@@ -7,12 +7,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from ..units import ARCSEC
 from .specification import ScenarioSpecification
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-ARCSEC = np.pi / 180.0 / 3600.0
 READINGS = {"A": np.sqrt(0.002), "B": 0.002, "C": np.deg2rad(np.sqrt(0.002)), "D": np.deg2rad(0.002)}
 """Sigma in rad per component of a direction, for each reading of "error covariance 0.002 I"."""
 POLICIES = ("zeros", "hold_last", "hold_mean", "hold_mean_raised", "commanded", "rate_state")

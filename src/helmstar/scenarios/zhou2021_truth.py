@@ -113,7 +113,7 @@ def _slews(attitude: Attitude, time: np.ndarray) -> Rotation:
 
 
 def _from_file(path: Path, time: np.ndarray) -> Rotation:
-    from ..io.attitude_file import read_attitude_profile
+    from ..io.profile import read_attitude_profile
 
     at, q = read_attitude_profile(path)
     at = at - at[0]
