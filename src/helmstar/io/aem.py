@@ -9,6 +9,7 @@ they stand. Numbers are written with 16 digits, the most that section 6.8.4 allo
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -219,7 +220,9 @@ def write_aem(
         q = conjugate(q_BN) + 0.0  # the standard knows no -0
         lines += [f"{t} {a:.15e} {b:.15e} {c:.15e} {d:.15e}" for t, (a, b, c, d) in zip(epoch, q.tolist())]
         lines += ["DATA_STOP", ""]
-    path.write_text("\n".join(lines), encoding="ascii", newline="\n")
+    part = path.with_name(path.name + ".part")
+    part.write_text("\n".join(lines), encoding="ascii", newline="\n")
+    os.replace(part, path)
 
 
 def _ascii(text: str) -> str:
