@@ -7,6 +7,7 @@ stderr states an error. Exit codes: 0 done, 1 an error that the message explains
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import os
 import shlex
@@ -143,8 +144,10 @@ def _say(text: str) -> None:
 
 
 def _command(args: argparse.Namespace) -> str:
-    """The command as typed, for the report."""
-    return "helmstar " + shlex.join(args.argv)
+    """The command as typed, for the report and for tables, whose texts are UTF-8."""
+    from .files import readable
+
+    return readable("helmstar " + shlex.join(args.argv))
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -152,10 +155,12 @@ def _run(args: argparse.Namespace) -> int:
     from .scenarios.specification import build, load, parse_set
 
     overrides = parse_set(args.set)
-    if args.runs is not None:
-        overrides["runs"] = args.runs
-    if args.seed is not None:
-        overrides["seed"] = args.seed
+    for key in ("runs", "seed"):
+        value = getattr(args, key)
+        if value is not None and key in overrides:
+            raise ConfigurationError(f"--{key} {value} and --set {key}: both set the same thing; give one of them")
+        if value is not None:
+            overrides[key] = value
     name, spec = load(args.scenario, overrides)
     if args.workers is not None and args.workers < 1:
         raise ConfigurationError(f"--workers {args.workers}: must be at least 1")
@@ -180,11 +185,12 @@ def _run(args: argparse.Namespace) -> int:
         batch=args.batch,
         dask=args.dask,
     )
+    from .files import write_atomically
     from .report.monte_carlo import write_monte_carlo_report
 
     claims = experiment.claims(outcome.dataset, outcome.summary)
     report = write_monte_carlo_report(outcome.dataset, outcome.summary, claims, folder / "report.html")
-    (folder / "summary.json").write_text(json.dumps(outcome.summary, allow_nan=False, indent=2), encoding="utf-8")
+    write_atomically(folder / "summary.json", json.dumps(outcome.summary, allow_nan=False, indent=2))
     if args.json:
         _print_json(outcome.summary)
     else:
@@ -287,6 +293,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     args = parser().parse_args(argv)
     args.argv = argv
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a file's name may hold bytes that are no text
     try:
         return args.call(args)
     except HelmstarError as error:

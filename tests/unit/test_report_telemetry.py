@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helmstar.report import allan, numbers, telemetry, telemetry_figures
+from helmstar.report import allan, telemetry, telemetry_figures
 
 _spec = importlib.util.spec_from_file_location(
     "report_samples", Path(__file__).parents[1] / "browser" / "report_samples.py"
@@ -76,9 +76,11 @@ def test_gate_of_three_degrees_of_freedom_is_the_limit_given():
 
 def test_quaternion_signs_become_continuous():
     _, frames = samples.telemetry(500)
-    q = frames["filtered"][[f"q_bn_{name}" for name in "xyzw"]].to_numpy().copy()
-    q[20] = np.nan
-    smooth = numbers.continuous_quaternion(q)
+    names = [f"q_bn_{name}" for name in "xyzw"]
+    frames["smoothed"].loc[100:200, names] *= -1.0
+    frames["smoothed"].loc[20, names] = np.nan
+    figure = telemetry_figures.attitude(frames, telemetry_figures.Clock.of(np.arange(500.0)), [])
+    smooth = np.array([trace["y"] for trace in figure["data"]]).T
     steps = np.abs(np.diff(smooth[np.isfinite(smooth).all(axis=1)], axis=0))
     assert steps.max() < 0.01
 

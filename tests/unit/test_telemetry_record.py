@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 from telemetry_solving import solve_files
@@ -178,6 +181,26 @@ def test_a_time_offset_is_added_to_the_stamp(capsys, tmp_path):
     np.savetxt(stars, d, "%.12g", ",", header="time_s,q_bn_x,q_bn_y,q_bn_z,q_bn_w", comments="")
     _, result, _ = attitude(capsys, tmp_path, GIVEN + "time_offset_s = 2.0\n")
     consistent(result)
+
+
+@pytest.mark.parametrize("command", ["attitude", "allan"])
+def test_names_of_files_and_folders_that_are_not_utf_8(capsys, tmp_path, command):
+    rows = [f"{t},{1e-5 * math.sin(7.0 * t * t)},{1e-5 * math.cos(5.0 * t * t)},1e-6,0,0,0,1" for t in range(60)]
+    header = "time_s,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s,q_bn_x,q_bn_y,q_bn_z,q_bn_w"
+    table, out = (tmp_path / os.fsdecode(name) for name in (b"t\xff.csv", b"out\xff"))
+    try:
+        table.write_text("\n".join([header, *rows]))
+    except OSError:
+        pytest.skip("this file system has no such names")
+    assert main([command, str(table), "--out", str(out)]) == 0
+    assert "report: " in capsys.readouterr().out
+    assert "t\ufffd.csv" in (out / "report.html").read_text(encoding="utf-8")
+    if command == "attitude":
+        assert len(pd.read_parquet(io.BytesIO((out / "smoothed.parquet").read_bytes()))) == 60
+        again = tmp_path / os.fsdecode(b"\xfe.parquet")
+        again.write_bytes((out / "smoothed.parquet").read_bytes())
+        assert main([command, str(table), str(again), "--out", str(out)]) == 0
+        assert "another file has a row at the same time" in capsys.readouterr().out  # so it was read
 
 
 def test_gaps_are_listed_and_bridged(capsys, tmp_path):

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import os
 from dataclasses import fields, is_dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -19,6 +18,7 @@ from types import FunctionType
 from typing import Any
 
 from ..backend import compile_program, jax, jnp
+from ..files import replacing
 from ..scenarios.experiment import Call
 
 
@@ -49,9 +49,8 @@ def exported(call: Call, data: Any) -> Any:
     if path is not None:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            part = path.with_suffix(f".{os.getpid()}.part")
-            part.write_bytes(made.serialize())
-            os.replace(part, path)
+            with replacing(path) as part:
+                part.write_bytes(made.serialize())
         except OSError:
             pass  # a full or read-only disk only means that the next start traces again
     return made

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 import xarray as xr
 
 from ..errors import CampaignError
+from ..files import replacing, write_atomically
 from ..scenarios.experiment import Experiment
 from .engine import Block
 
@@ -30,13 +30,6 @@ def fingerprint(manifest: dict[str, Any]) -> str:
     """Of everything that a run's bits depend on: the number of runs is not part of it."""
     relevant = {k: manifest[k] for k in ("specification", "estimators", "helmstar_version")}
     return hashlib.sha256(json.dumps(relevant, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)
 
 
 class Store:
@@ -109,9 +102,8 @@ class Store:
         """Keep a finished block."""
         ds = _dataset(block, experiment)
         path = self._path(block.index)
-        part = path.with_suffix(".part")
-        ds.to_netcdf(part, engine="h5netcdf")
-        os.replace(part, path)
+        with replacing(path) as part:
+            ds.to_netcdf(part, engine="h5netcdf")
         if ds.nbytes <= self._room:
             self._room -= ds.nbytes
             self._kept[block.index] = ds

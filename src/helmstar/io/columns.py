@@ -8,7 +8,6 @@ first of these that is there), `gyro_x_rad_s` (y, z; also deg_s, arcsec_s, deg_h
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -19,16 +18,16 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ..errors import DataError
+from ..units import ARCSEC, DEG, HOUR_S
 from .clock import Scale
 
 GyroUnit = Literal["rad/s", "deg/s", "arcsec/s", "deg/h", "rad", "deg", "arcsec"]
 Triple = Annotated[list[str], Field(min_length=3, max_length=3)]
 Quadruple = Annotated[list[str], Field(min_length=4, max_length=4)]
 
-_ARCSEC = math.pi / 648000.0
 UNIT_TO_SI: dict[str, float] = {
-    "rad/s": 1.0, "deg/s": math.pi / 180.0, "arcsec/s": _ARCSEC, "deg/h": math.pi / 648000.0,
-    "rad": 1.0, "deg": math.pi / 180.0, "arcsec": _ARCSEC,
+    "rad/s": 1.0, "deg/s": DEG, "arcsec/s": ARCSEC, "deg/h": DEG / HOUR_S,
+    "rad": 1.0, "deg": DEG, "arcsec": ARCSEC,
 }  # fmt: skip
 NATIVE_TIME: dict[str, Scale] = {
     "time_s": "s", "time_gps_s": "gps", "time_tai_s": "tai", "time_unix_s": "unix",

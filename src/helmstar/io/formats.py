@@ -48,4 +48,6 @@ def read_part(
             return read_gracefo(path, settings.gracefo, log)
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error}") from error
+    except UnicodeEncodeError as error:
+        raise DataError(f"{path}: the name is not UTF-8, and SPICE's library opens no such file; rename it") from error
     return clean(read_table(path, max_problems), maps, log)

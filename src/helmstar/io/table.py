@@ -111,7 +111,8 @@ def read_table(file: Path, max_problems: int = 1000) -> Table:
 
 def _read_parquet(file: Path) -> Table:
     try:
-        content = parquet.ParquetFile(file).read()
+        with open(file, "rb") as stream:  # the library opens no name that is not UTF-8
+            content = parquet.ParquetFile(stream).read()
     except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
         reason = str(error).split("\n")[0]
         raise DataError(f"{file}: this Parquet file is empty or damaged ({reason}); write it again") from error

@@ -28,10 +28,7 @@ from ..errors import ConfigurationError
 from ..io.clock import TimeOffsets
 from ..io.columns import ColumnsConfiguration
 from ..io.settings import AemConfiguration, FormatSettings, GraceFoConfiguration, SpiceConfiguration
-
-DEG = math.pi / 180.0
-ARCSEC = DEG / 3600.0
-HOUR_S = 3600.0
+from ..units import ARCSEC, DEG, HOUR_S
 
 ARW_UNITS = {"arw_arcsec_sqrt_s": ARCSEC, "arw_deg_sqrt_h": DEG / math.sqrt(HOUR_S), "arw_rad_sqrt_s": 1.0}
 RRW_UNITS = {

@@ -9,7 +9,6 @@ are pooled.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,17 +18,18 @@ import numpy as np
 
 from ..errors import DataError
 from ..evaluate.allan import AllanCurve, AllanFit, allan_deviation, fit_allan
+from ..files import readable, write_atomically
 from ..io.problems import refuse
 from ..io.screening import find_gaps, screen_gyro
 from ..io.telemetry import Telemetry, read_telemetry, to_rates
 from ..sensors.configuration import (
-    ARCSEC,
     ARW_UNITS,
     BIAS_INSTABILITY_UNITS,
     RRW_UNITS,
     SensorsConfiguration,
     load_sensors,
 )
+from ..units import ARCSEC
 from ..versions import versions
 from .allan_series import Series, minus_attitude, regular_series
 
@@ -131,8 +131,8 @@ def run_allan(
     }
     result["sensors_toml"] = _sensors_toml(result, sensors)
     folder.mkdir(parents=True, exist_ok=True)
-    _replace(folder / "sensors.toml", result["sensors_toml"])
-    _replace(folder / "allan.csv", _csv(axes))
+    write_atomically(folder / "sensors.toml", result["sensors_toml"])
+    write_atomically(folder / "allan.csv", _csv(axes))
     from ..report.allan import write_allan_report
 
     return result, Path(write_allan_report(result, folder / "report.html"))
@@ -241,7 +241,7 @@ def _sensors_toml(result: dict[str, Any], sensors: SensorsConfiguration) -> str:
         return f"{value:.5g}" + ("" if error is None else f" +- {error:.2g}")
 
     def plain(words: object) -> str:  # a file name may hold anything, and a comment ends with its line
-        return "".join(c if c.isprintable() else "?" for c in str(words))
+        return "".join(c if c.isprintable() else "?" for c in readable(str(words)))
 
     lines = [
         f"# helmstar allan, from {plain(result['file'])}: {result['samples']} samples of {result['basis']}, every "
@@ -276,10 +276,3 @@ def _csv(axes: dict[str, Axis]) -> str:
             cells += [f"{axis.curve.adev[k] / ARCSEC:.9g}", f"{axis.curve.error[k] / ARCSEC:.9g}", fit]
         lines.append(",".join(cells))
     return "\n".join(lines) + "\n"
-
-
-def _replace(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -13,14 +12,16 @@ import numpy as np
 import pandas as pd
 
 from ..core import ACCEPTED, FORCED, GATED, REOPENED
+from ..files import replacing, write_atomically
 from ..io.clock import Origin
 from ..io.screening import find_gaps
 from ..io.telemetry import Telemetry, read_telemetry
 from ..sensors.configuration import load_sensors
+from ..units import ARCSEC
 from ..versions import versions
 from .estimate import Estimates
 from .export import check_export, write_exports
-from .solve import ARCSEC, FROM_ATTITUDES, Solution, solve
+from .solve import FROM_ATTITUDES, Solution, solve
 
 STATUS = {ACCEPTED: "accepted", GATED: "gated", REOPENED: "reopened", FORCED: "forced"}
 
@@ -158,7 +159,7 @@ def run_attitude(
     telemetry = read_telemetry(
         files, sensors.columns or None, strict=strict, settings=settings, offsets=sensors.time_offsets
     )
-    check_export(telemetry.origin, aem=aem, ck=ck)
+    check_export(telemetry.origin, aem=aem, ck=ck, folder=folder)
     solution = solve(telemetry, sensors, strict, progress=True)
     result = result_of(solution, telemetry, files, command)
     if config is not None:
@@ -172,12 +173,11 @@ def run_attitude(
     tables = {}
     for name, frame in frames.items():
         path = folder / f"{name}.{'csv' if as_csv else 'parquet'}"
-        part = path.with_name(path.name + ".part")
-        if as_csv:
-            frame.to_csv(part, index=False)
-        else:
-            frame.to_parquet(part, index=False)
-        os.replace(part, path)
+        with replacing(path) as part, open(part, "wb") as stream:  # the library opens no name that is not UTF-8
+            if as_csv:
+                frame.to_csv(stream, index=False)
+            else:
+                frame.to_parquet(stream, index=False)
         tables[name] = str(path)
     result["tables"] = tables
     if aem or ck:
@@ -185,5 +185,5 @@ def run_attitude(
     from ..report.telemetry import write_telemetry_report
 
     report = write_telemetry_report(result, frames, folder / "report.html")
-    (folder / "summary.json").write_text(json.dumps(result, indent=2, allow_nan=False), encoding="utf-8")
+    write_atomically(folder / "summary.json", json.dumps(result, indent=2, allow_nan=False))
     return result, report

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..attitude import continuous
 from ..backend import jax, jnp
 from ..core import Gate, Gaussian, Measurement, Model
 from ..filters import ErrorStateKalmanFilter, run, smooth
@@ -175,9 +176,7 @@ def _first(belief: Gaussian) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _joined(parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Estimates:
     q, b, P = (np.concatenate(x) for x in zip(*parts, strict=True))
-    flips = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0)  # one continuous sign, sign(0) = +1
-    q = q * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
-    return Estimates(q, b, P)
+    return Estimates(continuous(q), b, P)
 
 
 def _info(infos: tuple[Any, ...], n: int) -> tuple[np.ndarray, ...]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DataError
+from ..files import readable
 from ..io.clock import Origin
 from ..io.screening import find_gaps
 from ..sensors.configuration import SensorsConfiguration
@@ -60,7 +61,7 @@ def write_exports(
     return out
 
 
-def check_export(origin: Origin, *, aem: bool, ck: bool) -> None:
+def check_export(origin: Origin, *, aem: bool, ck: bool, folder: Path | None = None) -> None:
     """Raise the DataErrors of an export before the work, not after it."""
     if (aem or ck) and not origin.absolute:
         raise DataError(
@@ -71,3 +72,5 @@ def check_export(origin: Origin, *, aem: bool, ck: bool) -> None:
         from ..io.spice_kernels import spice
 
         spice()
+        if readable(str(folder)) != str(folder):
+            raise DataError(f"--out {folder}: SPICE's library writes to no name that is not UTF-8; give another folder")

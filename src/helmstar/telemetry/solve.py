@@ -13,6 +13,7 @@ from ..io.screening import screen_gyro
 from ..io.telemetry import AttitudeRows, GyroRows, Telemetry, to_rates
 from ..progress import Progress
 from ..sensors.configuration import SensorsConfiguration
+from ..units import ARCSEC
 from .estimate import Estimates, Record, Start, Updates, filter_and_smooth
 from .noise import ENOUGH, NAMES, NoiseLevels, estimate_noise, rough_levels
 from .rates import RateSignal, rate_signal
@@ -21,7 +22,6 @@ from .stars import direction_epochs
 from .start import DIFFUSE, Beginning, find_beginning
 from .timeline import Epochs, Timeline, attitude_epochs, build_timeline, reachable
 
-ARCSEC = np.pi / 180.0 / 3600.0
 FROM_ATTITUDES = "first two attitudes minus the gyro"
 NOT_USED = "not used"
 """Action on rows that are good but of no use here: neither rejected nor an error when reading is strict."""
@@ -264,4 +264,4 @@ def _refused(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate) -
     return out
 
 
-__all__ = ["ARCSEC", "FROM_ATTITUDES", "NOT_USED", "Solution", "solve"]
+__all__ = ["FROM_ATTITUDES", "NOT_USED", "Solution", "solve"]
