@@ -42,22 +42,29 @@ def smooth_step(retraction: Retraction, filtered: Gaussian, predicted: Predicted
 
 
 @partial(jax.jit, static_argnames=("retraction",))
-def smooth(retraction: Retraction, filtered: Any, predicted: Predicted, last: Any | None = None) -> Gaussian:
+def smooth(
+    retraction: Retraction, filtered: Any, predicted: Predicted, last: Any | None = None, breaks: Array | None = None
+) -> Gaussian:
     """Smoothed beliefs of a whole track.
 
     filtered: beliefs after the updates, leading axis the step k = 0..N-1; predicted: predicted[k] leads to filtered[k]
     (as `run` records them). last: smoothed belief at N-1 when the track is part of a longer one, with predicted[0] of
-    the later part unused; default the filtered one. Returns smoothed beliefs, same leading axis.
+    the later part unused; default the filtered one. breaks (N,): True where filtered[k] was started anew and owes nothing
+    to predicted[k], so that what is known later says nothing of what was before. Returns smoothed beliefs, same leading
+    axis.
     """
     means, covs = filtered.mean, filtered.cov
     end = Gaussian(jax.tree.map(lambda a: a[-1], means), covs[-1]) if last is None else Gaussian(last.mean, last.cov)
 
     def body(later: Gaussian, inputs):
-        mean, cov, predicted = inputs
-        now = smooth_step(retraction, Gaussian(mean, cov), predicted, later)
+        mean, cov, predicted, broken = inputs
+        own = Gaussian(mean, cov)
+        now = smooth_step(retraction, own, predicted, later)
+        if broken is not None:
+            now = jax.tree.map(lambda a, b: jnp.where(broken, a, b), own, now)
         return now, now
 
     head = jax.tree.map(lambda a: a[:-1], (means, covs))
-    following = jax.tree.map(lambda a: a[1:], predicted)
-    _, track = jax.lax.scan(body, end, (*head, following), reverse=True)
+    following = jax.tree.map(lambda a: a[1:], (predicted, breaks))
+    _, track = jax.lax.scan(body, end, (*head, *following), reverse=True)
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), track, end)
