@@ -188,7 +188,7 @@ def triads(normal_b: Vector, first_b: Vector, normal_r: Vector, first_r: Vector)
 
 def outer_sum(w: list[Any], v: list[Vector]) -> list[Any]:
     """Upper triangle, rows first, of sum w v v^T."""
-    return [total([(a * u[j]) * u[k] for a, u in zip(w, v, strict=True)]) for j, k in _PAIRS]
+    return [total([(a * u[j]) * u[k] for a, u in zip(w, v, strict=True)]) for j, k in UPPER]
 
 
 def information(w: list[Any], v: list[Vector]) -> tuple[Matrix, Any, Any]:
@@ -199,7 +199,7 @@ def information(w: list[Any], v: list[Vector]) -> tuple[Matrix, Any, Any]:
     return c, dot(M[0], c[0]), c[0][0] + c[1][1] + c[2][2]
 
 
-_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def observable(d: Directions, gap: Any = None) -> Any:
@@ -249,13 +249,13 @@ def conclude(
         u = d if used is None else used
         C, det, _ = information(u.w, u.r)
         det = det * u.total
-        xx, xy, xz, yy, yz, zz = (C[j][k] / det for j, k in _PAIRS)
+        xx, xy, xz, yy, yz, zz = (C[j][k] / det for j, k in UPPER)
         C = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
         A = [apply(C, row) for row in R]  # the fitted directions' own is R C R^T
-        xx, xy, xz, yy, yz, zz = (dot(A[j], R[k]) for j, k in _PAIRS)
+        xx, xy, xz, yy, yz, zz = (dot(A[j], R[k]) for j, k in UPPER)
     else:
         nan = 0.0 * q[3]
-        xx, xy, xz, yy, yz, zz = (covariance[j][k] + nan for j, k in _PAIRS)
+        xx, xy, xz, yy, yz, zz = (covariance[j][k] + nan for j, k in UPPER)
     P = pack([xx, xy, xz, xy, yy, yz, xz, yz, zz], xp)
     q = q if frame is None else frame.back(q, xp)
     return WahbaSolution(pack(list(q), xp), P.reshape(*P.shape[:-1], 3, 3), loss, loss < np.inf)

@@ -8,6 +8,8 @@ M = (lam - s) [(lam + s) I - S] - z z^T (Mortari 2000; Markley and Mortari 2000,
 rows, and q = [(lam - s) e, z . e] / norm. It loses the axis of small turns, lam - s -> 0; the reference is turned by 180 deg
 about the axis that makes s least.
 
+Where the worst axis has less than 1e-11 of the weight, ESOQ's minors lose it, and its attitude can be off by its own sigma.
+
 lam is QUEST's: Newton from the sum of the weights. A start at anything else, such as 1 with weights of another sum, descends
 to another root.
 """
