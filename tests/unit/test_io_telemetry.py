@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from helmstar.errors import DataError
 from helmstar.io.clock import TimeOffsets
 from helmstar.io.columns import ColumnsConfiguration
+from helmstar.io.problems import KINDS
 from helmstar.io.telemetry import read_telemetry, to_rates
 
 FLIGHT = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "telemetry"
@@ -294,6 +295,12 @@ def test_tables_that_cannot_be_understood_say_why(tmp_path, content, columns, wo
 
 def test_gyro_alone_is_enough_where_only_it_is_needed(tmp_path):
     assert len(read(tmp_path, motion()[["time_s", *GYRO]], needs=["gyro"]).gyro) == 50
+
+
+def test_the_documentation_has_every_kind_of_problem():
+    table = (Path(__file__).parents[2] / "docs" / "telemetry.md").read_text(encoding="utf-8").split("## Bad rows")[1]
+    first_cells = "".join(line.split("|")[1] for line in table.split("\n## ")[0].splitlines() if line.startswith("|"))
+    assert not [kind for kind in KINDS if f"`{kind}`" not in first_cells]
 
 
 def test_a_file_twice_and_no_file(tmp_path):

@@ -7,20 +7,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from helmstar.telemetry.noise import NoiseLevels
+from helmstar.telemetry.rates import rate_signal
 from helmstar.telemetry.series import bring_back, pseudo_inverse
 from helmstar.telemetry.start import find_beginning
-from helmstar.telemetry.timeline import Epochs, Timeline
+from helmstar.telemetry.timeline import Epochs, Timeline, build_timeline
 
 
 def spin(rate: np.ndarray, step: float, drift: np.ndarray, n: int = 8, fine: int = 1) -> tuple[Timeline, Epochs]:
     """A constant rate seen with a drift, exact attitudes every `step` s, `fine` steps of the timeline between them."""
     time = step / fine * np.arange(n * fine + 1)
     q = Rotation.from_rotvec(-rate * time[::fine, None]).as_quat()
-    epoch = np.where(np.arange(len(time)) % fine == 0, np.arange(len(time)) // fine, -1)
-    rates = np.broadcast_to(rate + drift, (n * fine, 3))
+    signal = rate_signal(time, np.broadcast_to(rate + drift, (len(time), 3)), np.diff(time, prepend=np.nan), "instant")
     zero = np.zeros(n + 1, dtype=int)
     epochs = Epochs(time[::fine], q, np.broadcast_to(np.eye(3), (n + 1, 3, 3)), zero, zero, ("t.csv",))
-    return Timeline(time, rates, np.zeros_like(rates), epoch), epochs
+    return build_timeline(signal, epochs), epochs
 
 
 @pytest.mark.parametrize("turn", [1e-3, 0.0999, 0.1001, 0.5, 2.0, 3.5])

@@ -4,25 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
 from ..errors import DataError
+
+Kind = Literal[
+    "nan", "not_a_number", "ragged", "non_unit", "time_unreadable", "time_backwards", "time_repeated", "frame", "too_fast",
+    "jump", "unit", "flagged", "unused", "early", "no_gyro",
+]  # fmt: skip
+KINDS: tuple[Kind, ...] = get_args(Kind)
 
 
 @dataclass(frozen=True)
 class Problem:
     """One bad row of a file. `row` is the line number in a CSV (1-based), the data row (1-based) in Parquet.
 
-    kind: "nan", "not_a_number", "ragged", "non_unit", "time_unreadable", "time_backwards", "time_repeated", "frame",
-    "jump", "unit" or "flagged". action: "dropped", "normalised" or "converted"; "used" and "not used" are of good rows.
-    `rows` is how many rows it stands for: 1, or more where a file has so many of a kind that the rest are summed up, or
-    where a whole range is concerned.
+    kind: one of `KINDS`; docs/telemetry.md says what each means. action: "dropped", "normalised", "converted" or "used, its
+    sigma enlarged" (an attitude that the gate refused too often); "used" and "not used" are of good rows. `rows` is how
+    many rows it stands for: 1, or more where a file has so many of a kind that the rest are summed up, or where a whole
+    range is concerned.
     """
 
     file: str
     row: int
-    kind: str
+    kind: Kind
     message: str
     action: str
     rows: int = 1
@@ -37,9 +44,9 @@ class ProblemLog:
     def __init__(self, limit: int = 1000) -> None:
         self._limit = limit
         self._named: list[Problem] = []
-        self._rows: dict[tuple[str, str, str], np.ndarray] = {}
+        self._rows: dict[tuple[str, Kind, str], np.ndarray] = {}
 
-    def add(self, file: str, row: np.ndarray, kind: str, message: str | Callable[[int], str], action: str) -> None:
+    def add(self, file: str, row: np.ndarray, kind: Kind, message: str | Callable[[int], str], action: str) -> None:
         """Note the rows with these numbers; `message` may be a function of the index into `row`."""
         key = (file, kind, action)
         known = self._rows.get(key, np.empty(0, dtype=np.int64))

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .problems import Problem, ProblemLog
+from .problems import Kind, Problem, ProblemLog
 from .telemetry import AttitudeRows, GyroRows, Reading, to_rates
 
 DEG = 180.0 / math.pi  # 57.2958, the factor between numbers in degrees and in radians
@@ -158,7 +158,7 @@ def _integral(time: np.ndarray, value: np.ndarray, reading: Reading, start: np.n
 # ----------------------------------------------------------------------------- rows in the wrong unit
 
 
-def _rows_in_wrong_unit(gyro: GyroRows, attitude: AttitudeRows, reading: Reading) -> tuple[np.ndarray, str, str]:
+def _rows_in_wrong_unit(gyro: GyroRows, attitude: AttitudeRows, reading: Reading) -> tuple[np.ndarray, Kind, str]:
     """Runs of rows entered and left by a step of 57.3: the rows on the one side of these steps are wrong.
 
     Which side: the one whose correction the attitudes confirm; without attitudes there, the one with fewer rows. A
@@ -206,7 +206,7 @@ def _unit_steps(time: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndar
 # ----------------------------------------------------------------------------- spikes
 
 
-def _spikes(gyro: GyroRows, attitude: AttitudeRows, reading: Reading) -> tuple[np.ndarray, str, str]:
+def _spikes(gyro: GyroRows, attitude: AttitudeRows, reading: Reading) -> tuple[np.ndarray, Kind, str]:
     """Single rows far from the line between their neighbours, in a place where the rate hardly changes otherwise."""
     message = "a single gyro row far from both its neighbours, which agree with each other"
     bad = np.zeros(len(gyro), dtype=bool)

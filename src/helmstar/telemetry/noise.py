@@ -70,23 +70,32 @@ def _innovations(levels: Array, data: dict[str, Array], gate: Gate) -> tuple[Arr
         Pab = Pab + small.transpose(PbbBt) + 0.5 * u2 * T * B
         Pbb = Pbb + u2 * T * eye
         theta = theta + b @ Bt
-        V = small.invert_lower(small.cholesky(Paa + s2 * shape))
+        R = s2 * shape
+        S = Paa + R
+        V = small.invert_lower(small.cholesky(S))
         e = jnp.where(present, y - theta, 0.0)
         white = small.matvec(V, e)
         nis = jnp.sum(white**2, axis=-1)
         log_det = -2.0 * jnp.sum(jnp.log(jnp.diagonal(V, axis1=-2, axis2=-1)), axis=-1)
-        over = present & (nis > gate.limits[3])
+        # As the filter does (filters.ekf judge, grow, doubt): the reopen_after-th refusal in a row makes P grow, those that
+        # follow it are used with R times nis / 3.
+        over = present & ~(nis <= gate.limits[3])
+        forced = over & jnp.isfinite(nis) & (refused >= gate.reopen_after)
+        explained = jnp.sum(1.0 - jnp.diagonal(R, axis1=-2, axis2=-1) / jnp.diagonal(S, axis1=-2, axis2=-1), axis=-1)
+        larger = jnp.maximum(nis / jnp.maximum(explained, jnp.finfo(nis.dtype).eps), 1.0)
+        grow = jnp.where(over & jnp.isfinite(nis) & (refused + 1 == gate.reopen_after), larger, 1.0)[:, None, None]
         refused = jnp.where(present, jnp.where(over, refused + 1, 0), refused)
-        grow = jnp.where(over & (refused >= gate.reopen_after), nis / 3.0, 1.0)[:, None, None]
-        W = jnp.where((present & ~over)[:, None, None], V, 0.0)
+        W = jnp.where((present & (~over | forced))[:, None, None], V, 0.0)
         Ga, Gb = W @ Paa, W @ Pab  # K = [Ga Gb]^T W
         Gat, Gbt, white = small.transpose(Ga), small.transpose(Gb), small.matvec(W, e)
+        doubt = jnp.where(forced, nis / 3.0 - 1.0, 0.0)[:, None, None] * (W @ R @ small.transpose(W)) - eye
+        Ka, Kb = doubt @ Ga, doubt @ Gb
         carry = (
             theta + small.matvec(Gat, white),
             b + small.matvec(Gbt, white),
-            (Paa - Gat @ Ga) * grow,
-            (Pab - Gat @ Gb) * grow,
-            (Pbb - Gbt @ Gb) * grow,
+            (Paa + Gat @ Ka) * grow,
+            (Pab + Gat @ Kb) * grow,
+            (Pbb + Gbt @ Kb) * grow,
             refused,
         )
         return carry, (nis, log_det, over)
