@@ -56,8 +56,10 @@ def _explain_one(detail: Mapping[str, Any], model: type[BaseModel]) -> str:
         bound = next(iter(context.values()))
         return f"{key} = {value} is not allowed: must be {_COMPARISONS[kind]} {bound}"
     if kind in ("literal_error", "enum"):
+        word = detail["input"]
         close = _did_you_mean(
-            str(detail["input"]), context["expected"].replace("'", "").replace(" or ", ", ").split(", ")
+            word if isinstance(word, str) else "",
+            context["expected"].replace("'", "").replace(" or ", ", ").split(", "),
         )
         return f"{key} = {value} is not allowed{close}: must be {context['expected']}"
     if kind in ("too_short", "too_long"):
@@ -108,5 +110,8 @@ def _shown(value: Any) -> str:
     """A value as TOML would show it, cut where it is long."""
     if isinstance(value, BaseModel):
         value = value.model_dump()
-    text = json.dumps(value, default=str)
+    try:
+        text = json.dumps(value, default=str)
+    except (ValueError, RecursionError):  # an integer of thousands of digits, thousands of tables in each other
+        return "a value too long to show"
     return text if len(text) <= 80 else text[:77] + "..."

@@ -83,6 +83,8 @@ def test_a_reused_folder_holds_the_new_campaign(capsys, tmp_path):
         (["run", "xu2020", "--set", "star.sigma_arcsec=-3"], ["star.sigma_arcsec", "-3", ">= 0"]),
         (["run", "xu2020", "--set", "star.sigma"], ["KEY=VALUE"]),
         (["run", "xu2020", "--runs", "0"], ["runs", "0"]),
+        (["run", "xu2020", "--runs", "3", "--set", "runs=4"], ["--runs 3", "--set runs", "give one of them"]),
+        (["run", "xu2020", "--seed", "3", "--set", "seed=4"], ["--seed 3", "--set seed", "give one of them"]),
         (["run", "xu2020", "--estimators", "magic"], ["magic", "lie_printed"]),
         (["run", "xu2020", "--workers", "0"], ["--workers"]),
         (["run", "missing.toml"], ["missing.toml"]),

@@ -175,6 +175,19 @@ def test_another_law_is_an_error():
         rigid_body.simulate(np.arange(3.0), Q0, "inertial", rate=rate)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("rate", [np.full(3, np.nan), np.array([np.inf, 0.0, 0.0])])
+def test_a_rate_that_is_not_finite_is_refused(rate):
+    """The integrator would look for its first step for ever."""
+    with pytest.raises(ValueError, match=r"not finite at t = 0.0 s"):
+        rigid_body.simulate(np.arange(3.0), Q0, "body", rate=lambda _: rate)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # scipy's own arithmetic overflows
+def test_a_rate_too_fast_to_integrate_is_an_error_that_says_where():
+    with pytest.raises(ValueError, match=r"the integrator stopped at t = |not finite at t = "):
+        rigid_body.simulate(np.arange(3.0), Q0, "body", rate=lambda _: np.full(3, 1e300))
+
+
 def test_a_rate_that_ends_is_an_error():
     with pytest.raises(ValueError, match=r"the integrator stopped at t = 1.0 s: "):
         rigid_body.simulate(np.arange(4.0), Q0, "body", rate=lambda t: rate(t) if t < 1.7 else np.full(3, np.nan))

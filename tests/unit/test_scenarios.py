@@ -33,6 +33,34 @@ def test_set_takes_toml_values_and_bare_words(text, value):
     assert parse_set([text]) == {"a.b": value}
 
 
+def test_a_whole_number_is_a_number():
+    assert load("xu2020", {"star.sigma_arcsec": 5})[1].star.sigma_arcsec == 5.0
+
+
+@pytest.mark.parametrize(
+    ("texts", "words"),
+    [
+        (["star.sigma_arcsec=5\nfoo=7"], "must be one KEY=VALUE"),
+        (["a=1\n[b]"], "must be one KEY=VALUE"),
+        (["runs=3", "seed=1", "runs=4"], "runs is given twice"),
+        (["star={sigma_arcsec=3}", "star.sigma_arcsec=4"], "star and star.sigma_arcsec set the same thing"),
+        (["star.sigma_arcsec=4", "star={sigma_arcsec=3}"], "set the same thing"),
+        (["runs=" + "1" * 5000], "cannot be read"),
+        (["runs=" + "[" * 3000], "cannot be read"),
+        (["a" + ".a" * 2000 + "=3"], "no key has that many dots"),
+    ],
+)
+def test_a_set_that_would_be_half_heard_is_refused(texts, words):
+    with pytest.raises(ConfigurationError, match=words) as e:
+        parse_set(texts)
+    assert str(e.value).isprintable()
+    assert len(str(e.value)) < 250
+
+
+def test_set_keys_that_share_a_beginning_are_different():
+    assert parse_set(["star.sigma=1", "star.sigma_b=2"]) == {"star.sigma": 1, "star.sigma_b": 2}
+
+
 @pytest.mark.parametrize("text", ["star.sigma_arcsec", "=3", ""])
 def test_set_needs_key_and_value(text):
     with pytest.raises(ConfigurationError, match="must be KEY=VALUE"):
@@ -55,6 +83,23 @@ def test_set_needs_key_and_value(text):
         ({"width": 1}, ["width", ">= 2"]),
         ({"start.error_deg": 181}, ["start.error_deg", "180"]),
         ({"star": 3}, ["star", "table"]),
+        ({"truth.rate_frequency_rad_s": [float("nan"), 0, 0]}, ["truth.rate_frequency_rad_s[0]", "finite"]),
+        ({"truth.rate_frequency_rad_s": [4, 0, 0]}, ["truth.rate_frequency_rad_s", "step_s = 1.0", "pi rad"]),
+        ({"truth.rate_amplitude_rad_s": 1e300}, ["truth.rate_amplitude_rad_s", "1e+300"]),
+        ({"truth.rate_amplitude_rad_s": 2}, ["truth.rate_amplitude_rad_s", "step_s", "half a turn"]),
+        ({"truth.inertia_kg_m2": [1e9, 1e9, 1e-6]}, ["truth.inertia_kg_m2", "times the smallest"]),
+        ({"truth.inertia_kg_m2": [9, 1, 1]}, ["truth.inertia_kg_m2", "other two"]),
+        ({"step_s": 1e-300}, ["step_s", ">= 1e-06"]),
+        ({"star.sigma_arcsec": 1e300}, ["star.sigma_arcsec", "<= "]),
+        ({"star.sigma_arcsec": 1e-300}, ["star.sigma_arcsec", "0 (no noise)"]),
+        ({"gyro.sigma_rad_step": 1e200}, ["gyro.sigma_rad_step", "<= "]),
+        ({"tuning.p0": 1e-300}, ["tuning.p0", ">= "]),
+        ({"star.sigma_arcsec": "20"}, ["star.sigma_arcsec", '"20"', "number"]),
+        ({"star.sigma_arcsec": True}, ["star.sigma_arcsec", "true", "number"]),
+        ({"runs": 2.0}, ["runs", "2.0", "integer"]),
+        ({"runs": "2"}, ["runs", "integer"]),
+        ({"runs": int("f" * 5000, 16)}, ["runs", "too long to show"]),
+        ({"truth.rate": int("f" * 5000, 16)}, ["truth.rate", "too long to show"]),
     ],
 )
 def test_a_wrong_value_is_named(overrides, words):
@@ -76,6 +121,9 @@ def test_a_users_own_file_overrides_single_keys(tmp_path):
     [
         ("runs = 3", ["experiment", "xu2020"]),
         ('experiment = "xu2021"', ["xu2021", "xu2020"]),
+        ('experiment = ["xu2020"]', ["mine.toml", "experiment", "xu2020"]),
+        ("experiment = {a = 1}", ["mine.toml", "experiment", "xu2020"]),
+        ("a" + ".a" * 2000 + ' = 1\nexperiment = "xu2020"', ["mine.toml", "unknown key 'a'"]),
         ('experiment = "xu2020"\n[star]\nsigma = 3', ["mine.toml", "sigma"]),
         ("experiment = ", ["mine.toml", "TOML"]),
     ],

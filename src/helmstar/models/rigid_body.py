@@ -12,7 +12,6 @@ The torque that makes a prescribed rate a solution is N = J dw/dt + w x J w.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Literal, NamedTuple, get_args
 
@@ -63,7 +62,8 @@ def simulate(
     """Attitude at the given times, driven by a prescribed rate(t), or by Euler's equations from rate0 under torque(t).
 
     Integrated with scipy's DOP853 at 1e-13 relative. Raises ValueError when neither or both ways are given, for another
-    law, for times that are not two or more and increasing, for a rate or torque that is not finite, or when the integrator fails.
+    law, for times that are not two or more and increasing, for a rate or torque that is not finite at the start, or when the
+    integrator fails.
     """
     from scipy.integrate import solve_ivp
 
@@ -83,13 +83,13 @@ def simulate(
     def derivative(t: float, y: np.ndarray) -> np.ndarray:
         q, w = y[:4], (y[4:] if euler else rate_of(t))
         dq = _half_product(q, w, 1.0) if law == "printed" else _half_product(q, -w, -1.0)
-        if not math.isfinite(sum(dq)):  # the integrator would search for a step for ever
-            raise ValueError(f"the rate or the torque is not finite at t = {t} s")
         if not euler:
             return np.array(dq)
         return np.array([*dq, *(J_inverse @ (torque_at(t) - np.cross(w, J @ w)))])
 
     y0 = np.concatenate([np.asarray(q0, float), start])
+    if not np.all(np.isfinite(derivative(time[0], y0))):  # the integrator would look for its first step for ever
+        raise ValueError(f"the rate or the torque is not finite at t = {time[0]} s")
     step = float(np.min(np.diff(time)))
     s = solve_ivp(
         derivative, (time[0], time[-1]), y0, method="DOP853", t_eval=time, rtol=1e-13, atol=1e-15, max_step=20 * step

@@ -17,7 +17,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ..configuration import explain, read_toml
 from ..errors import ConfigurationError
 
-
 DEEPEST = 8
 """More dots than any key of a scenario has."""
 

@@ -15,6 +15,7 @@ Positive = Annotated[float, Field(ge=1e-30, le=1e12, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False)]
 Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 LEAST_STAR_ARCSEC = 1e-6
+LARGEST_INERTIA_RATIO = 1e6  # above it Euler's equations are so stiff that the integrator hardly moves
 
 
 class _Table(BaseModel):
@@ -26,13 +27,21 @@ class Truth(_Table):
     rate_amplitude_rad_s: Finite
     rate_frequency_rad_s: Vector3
     rate: Literal["prescribed", "euler"]
-    inertia_kg_m2: Annotated[list[Annotated[float, Field(ge=1e-6, le=1e9, allow_inf_nan=False)]], Field(min_length=3, max_length=3)]
+    inertia_kg_m2: Annotated[
+        list[Annotated[float, Field(ge=1e-6, le=1e9, allow_inf_nan=False)]], Field(min_length=3, max_length=3)
+    ]
 
     @field_validator("inertia_kg_m2")
     @classmethod
     def _is_of_a_body(cls, J: list[float]) -> list[float]:
         if 2.0 * max(J) > sum(J) * (1.0 + 1e-9):
-            raise ValueError(f"{J} is not allowed: of no body is a moment of inertia larger than the other two together")
+            raise ValueError(
+                f"{J} is not allowed: of no body is a moment of inertia larger than the other two together"
+            )
+        if max(J) > LARGEST_INERTIA_RATIO * min(J):
+            raise ValueError(
+                f"{J} is not allowed: the largest must be at most {LARGEST_INERTIA_RATIO:g} times the smallest"
+            )
         return J
 
     @field_validator("attitude")
