@@ -14,7 +14,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from . import __version__
 from .errors import HelmstarError
@@ -29,10 +29,18 @@ EPILOG = """examples:
 Every command has --help with an example. Documentation: README.md and docs/."""
 
 
+class _Parser(argparse.ArgumentParser):
+    """As argparse's, with an error's last line as every other error's. Subcommands' parsers are of this class too."""
+
+    def error(self, message: str) -> NoReturn:
+        self.print_usage(sys.stderr)
+        self.exit(2, f"error: {' '.join(message.splitlines())}\n")
+
+
 def parser() -> argparse.ArgumentParser:
     """The whole command line."""
     raw = argparse.RawDescriptionHelpFormatter
-    p = argparse.ArgumentParser(
+    p = _Parser(
         prog="helmstar",
         description="Spacecraft attitude from stars and gyros: simulate, estimate, and prove how well.",
         epilog=EPILOG,
@@ -144,10 +152,12 @@ def _say(text: str) -> None:
 
 
 def _command(args: argparse.Namespace) -> str:
-    """The command as typed, for the report and for tables, whose texts are UTF-8."""
+    """The command as typed, for the report and for tables, whose texts are UTF-8; without --resume, which reproduces nothing."""
     from .files import readable
 
-    return readable("helmstar " + shlex.join(args.argv))
+    resumes = {"--resume"[:n] for n in range(len("--re"), len("--resume") + 1)}  # argparse takes a beginning too
+    words = args.argv if args.command != "run" else [word for word in args.argv if word not in resumes]
+    return readable("helmstar " + shlex.join(words))
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -199,7 +209,7 @@ def _run(args: argparse.Namespace) -> int:
         print_campaign(outcome.summary)
         print(f"report: {report.resolve()}")
     if outcome.interrupted:
-        again = _command(args) + ("" if args.resume else " --resume")
+        again = _command(args) + " --resume"
         _say(f"interrupted: {outcome.summary['runs']} of {spec.runs} runs are kept in {folder}; go on with: {again}")
         return 130
     return 0
@@ -241,21 +251,22 @@ def _scenarios(args: argparse.Namespace) -> int:
     return 0
 
 
+def _telemetry(args: argparse.Namespace, unnamed: str) -> dict[str, Any]:
+    """What the commands on telemetry share; `unnamed`: what the default folder is named after where the file has no name."""
+    stem = Path(args.files[0]).stem or unnamed
+    return {
+        "config": None if args.config is None else Path(args.config),
+        "folder": Path(args.out or Path("helmstar-out") / f"{args.command}-{stem}"),
+        "strict": args.strict,
+        "command": _command(args),
+    }
+
+
 def _attitude(args: argparse.Namespace) -> int:
     from .telemetry.command import run_attitude
 
-    stem = Path(args.files[0]).stem or "telemetry"
-    folder = Path(args.out or Path("helmstar-out") / f"attitude-{stem}")
-    result, report = run_attitude(
-        [Path(f) for f in args.files],
-        config=None if args.config is None else Path(args.config),
-        folder=folder,
-        strict=args.strict,
-        as_csv=args.csv,
-        command=_command(args),
-        aem=args.aem,
-        ck=args.ck,
-    )
+    files = [Path(f) for f in args.files]
+    result, report = run_attitude(files, **_telemetry(args, "telemetry"), as_csv=args.csv, aem=args.aem, ck=args.ck)
     if args.json:
         _print_json(result)
     else:
@@ -271,15 +282,7 @@ def _attitude(args: argparse.Namespace) -> int:
 def _allan(args: argparse.Namespace) -> int:
     from .telemetry.allan import run_allan
 
-    stem = Path(args.files[0]).stem or "gyro"
-    folder = Path(args.out or Path("helmstar-out") / f"allan-{stem}")
-    result, report = run_allan(
-        [Path(f) for f in args.files],
-        config=None if args.config is None else Path(args.config),
-        folder=folder,
-        strict=args.strict,
-        command=_command(args),
-    )
+    result, report = run_allan([Path(f) for f in args.files], **_telemetry(args, "gyro"))
     if args.json:
         _print_json(result)
     else:

@@ -108,10 +108,29 @@ def test_an_error_is_one_message_on_stderr_without_a_traceback(capsys, tmp_path,
 
 
 def test_wrong_usage_exits_with_2(capsys):
-    for argv in ([], ["run"], ["fly"], ["run", "xu2020", "--runs", "many"]):
+    usages = (
+        [],
+        ["run"],
+        ["fly"],
+        ["run", "xu2020", "--runs", "many"],
+        ["run", "xu2020", "a\nb"],
+        ["attitude", "--fast"],
+    )
+    for argv in usages:
         with pytest.raises(SystemExit) as e:
             main(argv)
         assert e.value.code == 2
+        first, *_, last = capsys.readouterr().err.splitlines()
+        assert first.startswith("usage: helmstar")
+        assert last.startswith("error: ")
+
+
+def test_the_recorded_command_reproduces_from_nothing(capsys, tmp_path):
+    command = ["run", "xu2020", *SMALL, "--out", str(tmp_path), "--json"]
+    assert call(capsys, *command)[0] == 0
+    for word in ("--resume", "--re"):
+        assert call(capsys, *command, word)[0] == 0
+        assert "--re" not in json.loads((tmp_path / "campaign.json").read_text())["command"]
 
 
 @pytest.mark.parametrize("command", ["run", "scenarios", "attitude", "allan"])
