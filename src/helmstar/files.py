@@ -31,9 +31,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, text: str) -> Path:
-    """Write text as UTF-8, whole or not at all; what has no code there is shown as by `readable`."""
+    """Write text as UTF-8, lines ending in one newline, whole or not at all; what has no code is shown by `readable`."""
     with replacing(path) as part:
-        part.write_text(readable(text), encoding="utf-8")
+        part.write_text(readable(text), encoding="utf-8", newline="\n")
     return path
 
 

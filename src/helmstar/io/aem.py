@@ -9,7 +9,6 @@ they stand. Numbers are written with 16 digits, the most that section 6.8.4 allo
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from ..errors import DataError
+from ..files import write_atomically
 from .attitude_file import AttitudeSamples, attitude_part, conjugate, read_lines
 from .cleaning import Part
 from .clock import TT_MINUS_TAI_S, Instants, Origin, Scale, from_texts
@@ -220,9 +220,7 @@ def write_aem(
         q = conjugate(q_BN) + 0.0  # the standard knows no -0
         lines += [f"{t} {a:.15e} {b:.15e} {c:.15e} {d:.15e}" for t, (a, b, c, d) in zip(epoch, q.tolist())]
         lines += ["DATA_STOP", ""]
-    part = path.with_name(path.name + ".part")
-    part.write_text("\n".join(lines), encoding="ascii", newline="\n")
-    os.replace(part, path)
+    write_atomically(path, "\n".join(lines))
 
 
 def _ascii(text: str) -> str:

@@ -7,7 +7,6 @@ instants that types 1 and 3 store; other types, which hold polynomials, are samp
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DataError
+from ..files import replacing, write_atomically
 from .attitude_file import AttitudeSamples, attitude_part
 from .cleaning import Part
 from .clock import Origin
@@ -188,30 +188,26 @@ def write_ck(
     q_BN = np.vstack([segment.q_BN for segment in segments])
     rate_N = np.vstack([_in_N(segment.rate, segment.q_BN) for segment in segments])
     all_ticks = np.concatenate(ticks)
-    part = path.with_name(path.name + ".part")
-    part.unlink(missing_ok=True)
-    handle = None
-    try:
-        handle = library.ckopn(str(part), "helmstar attitude", 0)
-        if comments:
-            library.dafac(handle, [_ascii(comment) for comment in comments])
-        library.ckw03(
-            handle, all_ticks[0], all_ticks[-1], 1000 * settings.spacecraft_id, settings.reference, True,
-            "helmstar smoothed attitude", len(all_ticks), all_ticks,
-            np.ascontiguousarray(q_BN[:, [3, 0, 1, 2]]), rate_N,
-            len(ticks), np.array([t[0] for t in ticks]),
-        )  # fmt: skip
-        library.ckcls(handle)
-    except SpiceyError as error:
-        if handle is not None:
-            library.dafcls(handle)
-        part.unlink(missing_ok=True)
-        raise DataError(f"{path}: SPICE cannot write this CK: {first_line(error)}") from error
-    os.replace(part, path)
-    clock, leaps = path.with_suffix(".tsc"), path.with_suffix(".tls")
-    clock.write_text(clock_kernel(zero, settings.spacecraft_id, settings.frame), encoding="ascii", newline="\n")
-    leaps.write_text(leap_second_kernel(), encoding="ascii", newline="\n")
-    return [path, clock, leaps]
+    with replacing(path) as part:
+        part.unlink()  # SPICE writes to new files only
+        handle = None
+        try:
+            handle = library.ckopn(str(part), "helmstar attitude", 0)
+            if comments:
+                library.dafac(handle, [_ascii(comment) for comment in comments])
+            library.ckw03(
+                handle, all_ticks[0], all_ticks[-1], 1000 * settings.spacecraft_id, settings.reference, True,
+                "helmstar smoothed attitude", len(all_ticks), all_ticks,
+                np.ascontiguousarray(q_BN[:, [3, 0, 1, 2]]), rate_N,
+                len(ticks), np.array([t[0] for t in ticks]),
+            )  # fmt: skip
+            library.ckcls(handle)
+        except SpiceyError as error:
+            if handle is not None:
+                library.dafcls(handle)
+            raise DataError(f"{path}: SPICE cannot write this CK: {first_line(error)}") from error
+    clock = write_atomically(path.with_suffix(".tsc"), clock_kernel(zero, settings.spacecraft_id, settings.frame))
+    return [path, clock, write_atomically(path.with_suffix(".tls"), leap_second_kernel())]
 
 
 def _ascii(text: str) -> str:
