@@ -185,7 +185,7 @@ def test_settling_counts_the_last_excursion_and_lost_runs_as_never():
 def test_bands_and_quantiles_against_scipy_and_numpy():
     from scipy import stats
 
-    low, high = numbers.chi_square_band(300.0)
+    low, high = numbers.chi_square_ratio_band(300.0)
     assert np.allclose([low, high], stats.chi2.ppf([0.025, 0.975], 300) / 300)
     values = np.random.default_rng(0).standard_normal((9, 5))
     values[3, 2] = np.nan

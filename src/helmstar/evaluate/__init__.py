@@ -1,4 +1,4 @@
-"""Floor 2: consistency tests, bounds, convergence counts and paired comparisons. NumPy only."""
+"""Floor 2: consistency tests, bounds, convergence counts and paired comparisons, in NumPy and SciPy; no JAX."""
 
 from .bounds import Farrenkopf, farrenkopf, recursive_bound, steady_state_variance
 from .consistency import chi_square_band, correlation_factor, quadratic_form

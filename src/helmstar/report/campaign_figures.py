@@ -10,10 +10,9 @@ from . import figures, style
 from .campaign_data import SINGLE_POINTS, Campaign
 from .encode import extremes
 from .numbers import (
-    chi_square_band,
+    chi_square_ratio_band,
     euler_difference_deg,
     mean_over_runs,
-    rotation_from_quaternion,
     tait_bryan_deg,
     total_quantile,
 )
@@ -26,6 +25,8 @@ PREFERRED = ("lie_tuned", "lie", "quest_ekf")
 
 def add_paper_figures(page: Page, campaign: Campaign) -> None:
     """Figs. 3 and 4 of xu2020: one run's rotation-vector error, and its Euler-angle view beside it."""
+    from scipy.spatial.transform import Rotation
+
     rows = [
         ("Fig. 3, the filter on SO(3)", "lie"),
         ("Fig. 4, the quaternion EKF with both stars", "quaternion_ekf"),
@@ -35,7 +36,7 @@ def add_paper_figures(page: Page, campaign: Campaign) -> None:
     rows = [row for row in rows if row[1] in campaign.errors]
     if not rows or campaign.truth is None:
         return
-    pitch = tait_bryan_deg(rotation_from_quaternion(campaign.truth))[:, 1]
+    pitch = tait_bryan_deg(Rotation.from_quat(campaign.truth).as_matrix())[:, 1]
     locked = (
         f"The true pitch is at {pitch[0]:.0f} deg, where roll and yaw are not defined separately: the Euler view shows "
         "degrees of error that do not exist. "
@@ -158,9 +159,9 @@ def add_consistency(page: Page, campaign: Campaign) -> None:
         figure = figures.consistency(
             campaign.update[index],
             nees[index],
-            chi_square_band(nees_count[index] * campaign.nees_dof),
+            chi_square_ratio_band(nees_count[index] * campaign.nees_dof),
             nis[index],
-            chi_square_band(dof_sum[index]),
+            chi_square_ratio_band(dof_sum[index]),
             name,
             campaign.nees_dof,
         )
@@ -255,7 +256,7 @@ def _inside(values: np.ndarray, degrees: np.ndarray) -> float:
     finite = np.isfinite(values) & (degrees > 0)
     if not finite.any():
         return -1.0
-    low, high = chi_square_band(degrees[finite])
+    low, high = chi_square_ratio_band(degrees[finite])
     return float(np.mean((values[finite] >= low) & (values[finite] <= high)))
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from .campaign_data import Campaign
-from .numbers import chi_square_band
+from .numbers import chi_square_ratio_band
 from .page import Chip, Column, Page, number
 
 NEES_DEGREES = 3  # three attitude errors are scored for every estimator, whatever else it estimates
@@ -42,7 +42,7 @@ def headline(campaign: Campaign) -> tuple[str, ...]:
 def add_summary_table(page: Page, campaign: Campaign) -> None:
     """One row per estimator: convergence, error, bound, NEES, time."""
     runs = max(campaign.runs, 1)
-    low, high = (float(edge) * NEES_DEGREES for edge in chi_square_band(NEES_DEGREES * runs))
+    low, high = (float(edge) * NEES_DEGREES for edge in chi_square_ratio_band(NEES_DEGREES * runs))
     at = f"deg, update {_last_key(campaign)}"
     columns = [
         Column("Estimator", align="left"),
@@ -64,7 +64,7 @@ def add_summary_table(page: Page, campaign: Campaign) -> None:
 
 def nees_chip(nees: float, runs: int) -> Chip:
     """Is the covariance honest, judged by the band of one update for this number of runs?"""
-    low, high = (float(edge) * NEES_DEGREES for edge in chi_square_band(NEES_DEGREES * max(runs, 1)))
+    low, high = (float(edge) * NEES_DEGREES for edge in chi_square_ratio_band(NEES_DEGREES * max(runs, 1)))
     if nees > high:
         return Chip("bad", "over-confident")
     return Chip("part", "too cautious") if nees < low else Chip("good", "honest")
@@ -72,7 +72,7 @@ def nees_chip(nees: float, runs: int) -> Chip:
 
 def bound_chip(ratio: float, runs: int) -> Chip:
     """Is RMS over bound 1 within the scatter of this number of runs?"""
-    low, high = (float(edge) ** 0.5 for edge in chi_square_band(max(runs, 1)))
+    low, high = (float(edge) ** 0.5 for edge in chi_square_ratio_band(max(runs, 1)))
     if ratio > high:
         return Chip("plain", "above the bound")
     return Chip("plain", "below the bound") if ratio < low else Chip("good", "at the bound")

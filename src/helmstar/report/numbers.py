@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 
@@ -40,14 +38,15 @@ def total_quantile(sigma: np.ndarray, probability: float) -> np.ndarray:
 
 
 def settled_at(angle: np.ndarray, update: np.ndarray, threshold: float) -> np.ndarray:
-    """The update at which each series (..., time) goes below the threshold and stays; NaN if it never does."""
-    above = ~(angle < threshold)
-    count = angle.shape[-1]
-    first = np.where(above.any(axis=-1), count - np.argmax(above[..., ::-1], axis=-1), 0)
-    return np.where(first < count, update[np.minimum(first, count - 1)].astype(float), np.nan)
+    """The number in `update` (time,) at which each run of `angle` (run, time) goes below the threshold and stays; NaN if it
+    never does."""
+    from ..evaluate.convergence import arrival
+
+    place = arrival(angle, threshold).updates  # from 1, whatever `update` counts; 0 for never
+    return np.where(place > 0, update[np.maximum(place, 1) - 1].astype(float), np.nan)
 
 
-def chi_square_band(degrees: np.ndarray | float, probability: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+def chi_square_ratio_band(degrees: np.ndarray | float, probability: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
     """Two-sided band of a chi-square variable with so many degrees of freedom, divided by them (its mean is 1)."""
     from scipy.special import gammaincinv  # scipy.stats takes a second to import, and this is its own formula
 
@@ -65,26 +64,6 @@ def mean_over_runs(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan), count
 
 
-def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
-    """exp([v x]) for rotation vectors (..., 3), Rodrigues' formula; exact to rounding for every angle, 0 included."""
-    x, y, z = np.moveaxis(vector, -1, 0)
-    angle = np.sqrt(x * x + y * y + z * z)
-    a = np.sinc(angle / math.pi)
-    b = 0.5 * np.sinc(angle / (2.0 * math.pi)) ** 2
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vector.shape[:-1], 3, 3)
-    return np.eye(3) + a[..., None, None] * cross + b[..., None, None] * (cross @ cross)
-
-
-def rotation_from_quaternion(q: np.ndarray) -> np.ndarray:
-    """R of unit quaternions (..., 4), scalar last."""
-    u, w = q[..., :3], q[..., 3]
-    x, y, z = np.moveaxis(u, -1, 0)
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*q.shape[:-1], 3, 3)
-    return np.eye(3) + 2.0 * w[..., None, None] * cross + 2.0 * cross @ cross
-
-
 def tait_bryan_deg(rotation: np.ndarray) -> np.ndarray:
     """Roll, pitch, yaw (..., 3) in degrees of R = Rz(yaw) Ry(pitch) Rx(roll); singular at a pitch of +-90 deg."""
     roll = np.arctan2(rotation[..., 2, 1], rotation[..., 2, 2])
@@ -94,8 +73,14 @@ def tait_bryan_deg(rotation: np.ndarray) -> np.ndarray:
 
 
 def euler_difference_deg(truth_q: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Euler angles of the estimate minus those of the truth, in (-180, 180]: X_hat = X exp(-[error x])."""
-    truth = rotation_from_quaternion(truth_q)
-    estimate = truth @ rotation_from_vector(-error)
-    difference = tait_bryan_deg(estimate) - tait_bryan_deg(truth)
-    return -((-difference + 180.0) % 360.0 - 180.0)
+    """Euler angles of the estimate minus those of the truth, in (-180, 180]: X_hat = X exp(-[error x]).
+
+    truth_q (..., 4) scalar last, error (..., 3) in rad; (..., 3) roll, pitch, yaw in degrees; NaN for an
+    error that is not finite.
+    """
+    from scipy.spatial.transform import Rotation
+
+    truth, finite = Rotation.from_quat(truth_q), np.isfinite(error).all(axis=-1, keepdims=True)
+    estimate = truth * Rotation.from_rotvec(np.where(finite, -error, 0.0))  # scipy refuses a NaN
+    difference = tait_bryan_deg(estimate.as_matrix()) - tait_bryan_deg(truth.as_matrix())
+    return np.where(finite, -((-difference + 180.0) % 360.0 - 180.0), np.nan)

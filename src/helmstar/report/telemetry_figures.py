@@ -141,7 +141,7 @@ def residuals(updates: Any, clock: Clock, shapes: list[dict[str, Any]]) -> dict[
 
 def nis(updates: Any, clock: Clock, shapes: list[dict[str, Any]], gate: np.ndarray | None) -> dict[str, Any]:
     """NIS over its degrees of freedom per update, its running mean with a 95% band, and the gate; logarithmic."""
-    from .numbers import chi_square_band
+    from .numbers import chi_square_ratio_band
 
     time, status = clock(_column(updates, "time_s")), _status(updates)
     dof = _column(updates, "nis_dof")
@@ -160,7 +160,7 @@ def nis(updates: Any, clock: Clock, shapes: list[dict[str, Any]], gate: np.ndarr
         mean = (sums[window:] - sums[:-window]) / count
         middle = time[used][window // 2 : window // 2 + len(mean)]
         index = extremes(mean, NOISY)
-        low, high = chi_square_band(count[index])
+        low, high = chi_square_ratio_band(count[index])
         traces += band(middle[index], low, high, f"95% band of {window} updates", style.GREEN, 0.35)
         hover = f"%{{x:.5g}} {clock.unit}<br>mean %{{y:.4g}}"
         traces.append(line(middle[index], mean[index], f"mean of {window}", style.INK, width=1.8, hover=hover))

@@ -10,7 +10,7 @@ import numpy as np
 
 from . import style
 from .campaign_data import Campaign
-from .numbers import chi_square_band
+from .numbers import chi_square_ratio_band
 from .page import Chip, Column, Figure, Page, number
 from .style import axis, band, layout, line, log_axis
 
@@ -63,7 +63,7 @@ def _worst(values: Sequence[float | None]) -> Any:
 def add_summary(page: Page, summary: dict[str, Any]) -> None:
     """One row for each estimator."""
     runs = summary["runs"]
-    low, high = (6.0 * float(v) for v in chi_square_band(6 * runs))
+    low, high = (6.0 * float(v) for v in chi_square_ratio_band(6 * runs))
     columns = [
         Column("Estimator", align="left"),
         Column("Attitude RMS", "deg; x, y, z"),

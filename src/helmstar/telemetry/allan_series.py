@@ -193,6 +193,3 @@ def _jumps(start: np.ndarray, angle: np.ndarray, count: int) -> np.ndarray:
     to_and_fro[1:-1] &= calm[:-3] & calm[3:]
     jump[start[1:][to_and_fro.any(axis=1) & neighbours]] = True
     return jump if jump.mean() <= JUMPS_ARE_RARE else np.zeros(count, dtype=bool)
-
-
-# ----------------------------------------------------------------------------- from series to parameters
