@@ -72,6 +72,9 @@ class Setup:
     star_gaps: tuple[tuple[float, float], ...] = ()
     stars: tuple[int, int] | None = None  # fewest and most star directions of an epoch instead of attitudes
     field_deg: float = 20.0
+    misalignment_arcsec: tuple[float, float, float] = (0.0, 0.0, 0.0)  # R_GB = exp([mu x])
+    scale_ppm: tuple[float, float, float] = (0.0, 0.0, 0.0)  # a gyro axis reads too much by this share
+    upset_s: float | None = None  # the body is turned by 90 deg about y between two instants, which no gyro sees
     seed: int = 0
 
 
@@ -147,16 +150,24 @@ def simulate(setup: Setup) -> Simulated:
     q0 = Rotation.from_quat(rng.normal(size=4))
     q_nodes = (_cumulative(Rotation.from_rotvec(-_turn(setup.rate, nodes[:-1], h))) * q0).as_quat()
     q_nodes = np.concatenate([q0.as_quat()[None], q_nodes])
+    if setup.upset_s is not None:
+        k = int(np.searchsorted(nodes, setup.upset_s))
+        there = Rotation.from_quat(q_nodes[k])
+        jump = there.inv() * Rotation.from_rotvec([0.0, np.pi / 2, 0.0]) * there  # seen from N
+        q_nodes[k:] = (Rotation.from_quat(q_nodes[k:]) * jump).as_quat()
+    G = (1.0 + 1e-6 * np.array(setup.scale_ppm))[:, None] * Rotation.from_rotvec(
+        np.array(setup.misalignment_arcsec) * ARCSEC
+    ).as_matrix()
 
     walk = setup.rrw_arcsec_s_sqrt_s * ARCSEC * np.sqrt(h)[:, None] * rng.normal(size=(len(h), 3))
     drift = np.concatenate([np.zeros((1, 3)), np.cumsum(walk, axis=0)]) + np.array(setup.drift_arcsec_s) * ARCSEC
     white = setup.arw_arcsec_sqrt_s * ARCSEC / np.sqrt(dt) * rng.normal(size=(len(gyro_t), 3))
     here = np.searchsorted(nodes, gyro_t)
     if setup.reading == "instant":
-        value = setup.rate(gyro_t) + drift[here] + white
+        value = setup.rate(gyro_t) @ G.T + drift[here] + white
     else:
         w1, w2 = setup.rate(nodes[:-1] + (0.5 - GAUSS) * h), setup.rate(nodes[:-1] + (0.5 + GAUSS) * h)
-        angle = 0.5 * h[:, None] * (w1 + w2 + drift[:-1] + drift[1:])
+        angle = 0.5 * h[:, None] * ((w1 + w2) @ G.T + drift[:-1] + drift[1:])
         total = np.concatenate([np.zeros((1, 3)), np.cumsum(angle, axis=0)])[here]
         before = np.concatenate([np.zeros((1, 3)), total[:-1]])
         value = (total - before) / dt + white

@@ -62,11 +62,14 @@ class RestartFromStars:
 
 @dataclass(frozen=True)
 class RestartFromAttitude:
-    """As `RestartFromStars`, from a measured attitude z with the covariance that is its context."""
+    """As `RestartFromStars`, from a measured attitude z with the covariance that is its context; other sensors restart
+    nothing."""
 
     retraction: Retraction = so3_left
 
     def __call__(self, belief: ResettableBelief, sensor: Sensor, m: Measurement) -> tuple[ResettableBelief, Array]:
+        if jnp.shape(m.z) != (4,):
+            return belief, jnp.asarray(False)
         ok = jnp.all(m.mask) & jnp.isfinite(m.z).all() & jnp.isfinite(m.a).all()
         q = jnp.where(ok, m.z, belief.mean.q_BN)
         cov = jnp.where(ok, m.a, jnp.eye(3, dtype=m.a.dtype))

@@ -10,10 +10,11 @@
 | rows_rejected, gaps | count, list of {start_s, end_s, duration_s, what} |
 | problems | list of {file, row, kind, message, action}, and `rows` if one stands for several |
 | noise | {name with unit: {value, source}}, source "sensors.toml" or "estimated from the data" |
+| calibration | {misalignment_arcsec, scale_factor_ppm: {value, sigma, sigma_before, bound, observable}}, each [x, y, z] |
 | gate_limit, sensors_toml, title, headline | limit of NIS at 3 degrees of freedom; texts |
 
 `frames`: "filtered" and "smoothed" (time_s, q_bn_x .. q_bn_w, drift_x_arcsec_s .., sigma_attitude_x_arcsec ..,
-sigma_drift_x_arcsec_s ..) and "updates" (time_s, nis, nis_dof, status "accepted", "gated", "reopened" or "forced",
+sigma_drift_x_arcsec_s ..) and "updates" (time_s, nis, nis_dof, status "accepted", "gated", "reopened", "forced" or "restarted",
 residual_x_arcsec .. in B, and optionally residual_sigma_x_arcsec ..). `gaps` and frames share one clock.
 """
 
@@ -47,6 +48,7 @@ def telemetry_page(result: dict[str, Any], frames: Mapping[str, pandas.DataFrame
     page.section("Result")
     page.headline(*_headline(result))
     _add_drift_table(page, result)
+    _add_calibration(page, result)
     _add_figures(page, result, frames)
     page.section("Data quality: problems, gaps, refused rows", short="Data quality")
     _add_quality(page, result)
@@ -111,6 +113,43 @@ def _add_drift_table(page: Page, result: dict[str, Any]) -> None:
         columns = [Column("Mean NIS", align="left"), Column("Band"), Column("Verdict", align="left")]
         row = [mean, f"{number(limits[0])} to {number(limits[1])}", (chip, text)]
         page.table([*columns], [row])
+
+
+def _add_calibration(page: Page, result: dict[str, Any]) -> None:
+    """Misalignment and scale factors, with what the record allows to be known of them."""
+    rows = []
+    for name, c in (result.get("calibration") or {}).items():
+        what, unit = name.rsplit("_", 1)
+        for i, axis in enumerate("xyz"):
+            shown = c["observable"][i]
+            chip = Chip("good", "shown") if shown else Chip("part", "not shown")
+            rows.append(
+                [
+                    f"{what.replace('_', ' ')} {axis}",
+                    unit,
+                    c["value"][i],
+                    c["sigma"][i],
+                    c["sigma_before"][i],
+                    c["bound"][i],
+                    chip,
+                ]
+            )
+    if not rows:
+        return
+    columns = [
+        Column("Calibration", align="left"),
+        Column("Unit", align="left"),
+        Column("Value", digits=5),
+        Column("1 sigma"),
+        Column("before"),
+        Column("bound"),
+        Column("In this record"),
+    ]
+    page.table(
+        columns, rows,
+        caption="Misalignment of the gyro to the star tracker and scale factors. What the bound leaves at more than half of "
+        "what was known before is not estimated.",
+    )  # fmt: skip
 
 
 def _add_figures(page: Page, result: dict[str, Any], frames: Mapping[str, pandas.DataFrame]) -> None:

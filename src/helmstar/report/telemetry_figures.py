@@ -198,6 +198,7 @@ def _refused(
         ("gated", "refused by the gate", style.RED, "x"),
         ("reopened", "refused, gate reopened", style.VIOLET, "diamond"),
         ("forced", "used against the gate", style.VIOLET, "diamond-open"),
+        ("restarted", "restarted from it", style.GREEN, "star"),
     ):
         rows = np.flatnonzero(status == kind)[:REFUSED]
         if rows.size:

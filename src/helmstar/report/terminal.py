@@ -71,6 +71,15 @@ def print_attitude(result: dict[str, Any]) -> None:
     drift, sigma = result["drift_arcsec_s"], result["drift_sigma_arcsec_s"]
     for axis, d, s in zip("xyz", drift, sigma, strict=True):
         print(f"drift {axis}: {_number(d, 6)} +- {_number(s, 2)} arcsec/s")
+    for name, c in (result.get("calibration") or {}).items():
+        unit = name.rsplit("_", 1)[1]
+        for axis, v, e, before in zip("xyz", c["value"], c["sigma"], c["sigma_before"], strict=True):
+            text = (
+                f"{_number(v, 6)} +- {_number(e, 2)} {unit}"
+                if v is not None
+                else f"not shown by this record (+- {_number(before, 3)} {unit})"
+            )
+            print(f"{name.removesuffix('_' + unit).replace('_', ' ')} {axis}: {text}")
     print(f"mean NIS {_number(result['nis_mean'])} (3 when consistent), {result['updates']} updates")
     print(f"rows rejected: {result['rows_rejected']}, gaps: {len(result['gaps'])}")
     for p in result["problems"][:10]:

@@ -87,6 +87,22 @@ class GyroConfiguration(_Table):
     initial_drift_sigma_arcsec_s: Positive | None = None
     reading: Literal["instant", "mean_since_previous", "increment_rad"] = "instant"
     time_offset_s: Offset = Field(default=0.0, description="time of a sample = its stamp + this")
+    loss_policy: Literal[
+        "interpolate", "hold_last", "hold_mean", "hold_mean_raised", "zeros", "commanded", "rate_state"
+    ] = Field(default="interpolate", description="what stands for lost gyro data")
+    hold_s: Positive = Field(default=30.0, description="what hold_mean averages")
+    raised_deg_s: Positive = Field(default=0.5, description="1 sigma of a rate held with hold_mean_raised")
+    commanded_rate_deg_s: Annotated[list[Finite], Field(min_length=3, max_length=3)] | None = None
+    command_error: NotNegative = Field(default=0.01, description="1 sigma of the commanded rate, relative to its length")
+    rate_sigma_deg_s: Positive | None = Field(
+        default=None, description="rate_state: random walk of the rate, deg/s/sqrt(s); None: what the record shows"
+    )
+
+    @model_validator(mode="after")
+    def _commanded_needs_a_rate(self) -> GyroConfiguration:
+        if self.loss_policy == "commanded" and self.commanded_rate_deg_s is None:
+            raise ValueError('loss_policy = "commanded" needs commanded_rate_deg_s = [x, y, z], the rate in body axes')
+        return self
 
     @model_validator(mode="after")
     def _one_unit_each(self) -> GyroConfiguration:
@@ -193,6 +209,28 @@ class FilterConfiguration(_Table):
     reopen_after: Annotated[int, Field(ge=1, le=1_000_000)] = Field(
         default=5, description="refusals in a row after which one is accepted"
     )
+    restart: bool = Field(
+        default=False, description="after so many refusals start anew from the attitude instead of opening the gate"
+    )
+    restart_drift_sigma_deg_h: Positive = Field(
+        default=1000.0, description="1 sigma of the drift after a restart that follows soon after another"
+    )
+
+
+class CalibrateConfiguration(_Table):
+    """`[calibrate]`: what is estimated of the gyro beside its drift, where the record shows it."""
+
+    misalignment: bool = Field(default=False, description="small turn of the gyro's axes from the star tracker's body")
+    scale_factor: bool = Field(default=False, description="by which share each gyro axis reads too much")
+    misalignment_sigma_deg: Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)] = 1.0
+    scale_factor_sigma_ppm: Annotated[float, Field(gt=0, le=2e5, allow_inf_nan=False)] = 10000.0
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """1 sigma (6,) before the record is looked at: misalignment in rad, scale factors; 0 of what is not asked for."""
+        misalignment = math.radians(self.misalignment_sigma_deg) if self.misalignment else 0.0
+        scale = 1e-6 * self.scale_factor_sigma_ppm if self.scale_factor else 0.0
+        return np.repeat([misalignment, scale], 3)
 
 
 class SensorsConfiguration(_Table):
@@ -202,9 +240,19 @@ class SensorsConfiguration(_Table):
     gyro: GyroConfiguration = GyroConfiguration()
     star: StarConfiguration = StarConfiguration()
     filter: FilterConfiguration = FilterConfiguration()
+    calibrate: CalibrateConfiguration = CalibrateConfiguration()
     gracefo: GraceFoConfiguration = GraceFoConfiguration()
     aem: AemConfiguration = AemConfiguration()
     spice: SpiceConfiguration = SpiceConfiguration()
+
+    @model_validator(mode="after")
+    def _one_model(self) -> SensorsConfiguration:
+        if self.gyro.loss_policy == "rate_state" and self.calibrate.sigma.any():
+            raise ValueError(
+                'calibrate and gyro.loss_policy = "rate_state" do not go together: with the rate as a state there is no '
+                "gyro to calibrate in a loss; choose another loss_policy"
+            )
+        return self
 
     @property
     def time_offsets(self) -> TimeOffsets:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ..core import ACCEPTED, FORCED, GATED, REOPENED
+from ..core import ACCEPTED, FORCED, GATED, REOPENED, RESET
 from ..files import replacing, write_atomically
 from ..io.clock import Origin
 from ..io.screening import find_gaps
@@ -19,11 +19,12 @@ from ..io.telemetry import Telemetry, read_telemetry
 from ..sensors.configuration import load_sensors
 from ..units import ARCSEC
 from ..versions import versions
+from .calibration import NAMES as CALIBRATED_NAMES
 from .estimate import Estimates
 from .export import check_export, write_exports
 from .solve import FROM_ATTITUDES, Solution, solve
 
-STATUS = {ACCEPTED: "accepted", GATED: "gated", REOPENED: "reopened", FORCED: "forced"}
+STATUS = {ACCEPTED: "accepted", GATED: "gated", REOPENED: "reopened", FORCED: "forced", RESET: "restarted"}
 
 
 def _times(t: np.ndarray, origin: Origin) -> np.ndarray:
@@ -42,6 +43,11 @@ def estimates_table(solution: Solution, estimates: Estimates, origin: Origin) ->
     columns |= {f"drift_{a}_arcsec_s": estimates.drift[:, i] / ARCSEC for i, a in enumerate("xyz")}
     columns |= {f"sigma_attitude_{a}_arcsec": sigma[:, i] for i, a in enumerate("xyz")}
     columns |= {f"sigma_drift_{a}_arcsec_s": sigma[:, 3 + i] for i, a in enumerate("xyz")}
+    if estimates.calibration is not None and estimates.calibration_sigma is not None:
+        for i, name in enumerate(CALIBRATED_NAMES):
+            unit, column = (ARCSEC, f"{name}_arcsec") if i < 3 else (1e-6, f"{name}_ppm")
+            columns[column] = estimates.calibration[:, i] / unit
+            columns[f"sigma_{column}"] = estimates.calibration_sigma[:, i] / unit
     names = ["theta_x", "theta_y", "theta_z", "b_x", "b_y", "b_z"]
     columns |= {f"cov_{names[i]}_{names[j]}": estimates.cov[:, i, j] for i in range(6) for j in range(i, 6)}
     return pd.DataFrame(columns)
@@ -104,6 +110,34 @@ def _noise(solution: Solution) -> dict[str, Any]:
     }
 
 
+def _calibration(solution: Solution) -> dict[str, Any]:
+    """Misalignment and scale factors at the end, their sigma, what the record allows, and which of them it shows."""
+    c, e = solution.calibration, solution.filtered
+    if c is None or e.calibration is None or e.calibration_sigma is None:
+        return {}
+
+    def three(values: Any, part: slice, unit: float) -> list[float | None]:
+        return [
+            _finite(v) if asked > 0.0 else None for v, asked in zip(values[part] / unit, c.prior[part], strict=True)
+        ]
+
+    out: dict[str, Any] = {}
+    for name, part, unit in (("misalignment_arcsec", slice(0, 3), ARCSEC), ("scale_factor_ppm", slice(3, 6), 1e-6)):
+        if not c.prior[part].any():
+            continue
+        shown = c.observable[part]
+        out[name] = {
+            "value": [v if ok else None for v, ok in zip(three(e.calibration[-1], part, unit), shown, strict=True)],
+            "sigma": [
+                v if ok else None for v, ok in zip(three(e.calibration_sigma[-1], part, unit), shown, strict=True)
+            ],
+            "sigma_before": three(c.prior, part, unit),
+            "bound": three(c.bound, part, unit),
+            "observable": [bool(v) for v in shown],
+        }
+    return {"calibration": out}
+
+
 def result_of(solution: Solution, telemetry: Telemetry, files: Sequence[Path], command: str) -> dict[str, Any]:
     """The object of `--json`: finite numbers, nulls, strings."""
     s = solution
@@ -131,7 +165,9 @@ def result_of(solution: Solution, telemetry: Telemetry, files: Sequence[Path], c
         "drift_sigma_arcsec_s": [float(v) for v in sigma[3:] / ARCSEC],
         "attitude_sigma_arcsec": [float(v) for v in sigma[:3] / ARCSEC],
         "q_bn": [float(v) for v in s.filtered.q_BN[-1]],
+        **_calibration(s),
         **_consistency(s),
+        "restarts": int(np.sum(s.updates.status == RESET)),
         "gate_limit": _finite(np.asarray(s.gate.limits)[3]),
         "rows_rejected": sum(p.rows for p in s.problems if p.action == "dropped"),
         "gaps": gaps,

@@ -9,17 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 
 from ..attitude import continuous
 from ..backend import jax, jnp
-from ..core import Gate, Gaussian, Measurement, Model
-from ..filters import ErrorStateKalmanFilter, run, smooth
+from ..core import RESET, Gate, Gaussian, Measurement, Model
+from ..filters import ErrorStateKalmanFilter, ResettableBelief, ResettingFilter, RestartFromAttitude, run, smooth
 from ..geometry import so3_left
 from ..geometry.retraction import euclidean, product
 from ..models.attitude import AttitudeDrift, GyroInput, GyroNoise, attitude_drift_model, whole_attitude
+from ..models.attitude_rate import AttitudeRateDrift, RateNoise, attitude_rate_model, gyro_rate
+from ..models.calibration import AttitudeCalibration, calibration_model
 from ..models.sensors import unit_star_directions
 from .noise import NoiseLevels
 from .timeline import Epochs, Timeline
@@ -27,8 +30,38 @@ from .timeline import Epochs, Timeline
 Array = jax.Array
 CHUNK = 1024
 """Steps of one compiled call."""
-RETRACTION = product(AttitudeDrift, so3_left, euclidean(3))
-FILTER = ErrorStateKalmanFilter(RETRACTION)
+SIX = np.arange(6)
+RATED_SIX = np.array([0, 1, 2, 6, 7, 8])
+LEAST_SIGMA = 1e-12
+"""Of a state that is held fixed (rad, or a ratio): no variance at all would make its covariance singular."""
+States = Literal["drift", "calibration", "rate"]
+
+
+@dataclass(frozen=True)
+class Design:
+    """Which states are estimated and how: attitude and drift; with them misalignment and scale factors, of prior sigma
+    `calibration` (6,); or with them the rate, of random walk `rate_sigma` rad/s/sqrt(s), the gyro being a sensor. `restart`:
+    sigma of the drift (rad/s) after a second restart, None for a gate that opens instead. `commanded`: rates of gaps have
+    no drift."""
+
+    states: States = "drift"
+    calibration: np.ndarray | None = None
+    rate_sigma: float = 0.0
+    restart: float | None = None
+    commanded: bool = False
+
+    @property
+    def filter(self) -> Any:
+        """Of its kind; equal designs have equal ones."""
+        cls = {"drift": AttitudeDrift, "calibration": AttitudeCalibration, "rate": AttitudeRateDrift}[self.states]
+        beside = {"drift": 1, "calibration": 3, "rate": 2}[self.states]
+        inner = ErrorStateKalmanFilter(product(cls, so3_left, *[euclidean(3)] * beside))
+        return inner if self.restart is None else ResettingFilter(inner, RestartFromAttitude())
+
+    @property
+    def six(self) -> np.ndarray:
+        """Where attitude and drift are among the errors."""
+        return RATED_SIX if self.states == "rate" else SIX
 
 
 @dataclass(frozen=True)
@@ -43,11 +76,14 @@ class Start:
 
 @dataclass(frozen=True)
 class Estimates:
-    """At each instant of the timeline: q_BN (n, 4), drift (n, 3) rad/s, cov (n, 6, 6) in rad and rad/s, axes of B."""
+    """At each instant of the timeline: q_BN (n, 4), drift (n, 3) rad/s, cov (n, 6, 6) in rad and rad/s, axes of B; where they
+    are estimated, misalignment (rad) and scale factors (n, 6), and their sigma (n, 6)."""
 
     q_BN: np.ndarray
     drift: np.ndarray
     cov: np.ndarray
+    calibration: np.ndarray | None = None
+    calibration_sigma: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -63,33 +99,47 @@ class Updates:
     sigma: np.ndarray
 
 
-def model_of(levels: NoiseLevels, directions: bool) -> Model:
-    """The 6-state model with whole attitudes and, where an epoch has nothing else, single star directions."""
+def model_of(levels: NoiseLevels, directions: bool, design: Design) -> Model:
+    """The design's model with whole attitudes and, where an epoch has nothing else, single star directions."""
     sensors = (whole_attitude(), unit_star_directions(levels.sigma)) if directions else (whole_attitude(),)
-    return attitude_drift_model(GyroNoise(jnp.asarray(levels.sigma_v), jnp.asarray(levels.sigma_u)), sensors=sensors)
+    noise = GyroNoise(jnp.asarray(levels.sigma_v), jnp.asarray(levels.sigma_u))
+    if design.states == "calibration":
+        return calibration_model(noise, sensors)
+    if design.states == "rate":
+        rates = RateNoise(jnp.asarray(design.rate_sigma), jnp.asarray(levels.sigma_u))
+        return attitude_rate_model(rates, sensors=(gyro_rate(), *sensors))
+    return attitude_drift_model(noise, sensors=sensors)
 
 
-@jax.jit
+@partial(jax.jit, static_argnames=("filter",))
 def _forward(
-    model: Model, belief: Gaussian, refused: Array, u: GyroInput, dt: Array, m: tuple[Measurement, ...], gate: Gate
-) -> Any:
-    return run(FILTER, model, belief, u, dt, m, gate, refused)
+    filter: Any, model: Model, belief: Any, refused: Array, u: GyroInput, dt: Array, m: tuple[Measurement, ...],
+    gate: Gate,
+) -> Any:  # fmt: skip
+    return run(filter, model, belief, u, dt, m, gate, refused)
 
 
-@jax.jit
-def _backward(begin: Gaussian, track: Any, later: Gaussian) -> Gaussian:
+@partial(jax.jit, static_argnames=("filter",))
+def _backward(filter: Any, begin: Any, track: Any, later: Gaussian) -> Gaussian:
     """Smoothed beliefs at the begin of a chunk and after each of its steps; `later` is the one at its end."""
     front = lambda a, b: jnp.concatenate([a[None], b])  # noqa: E731
     filtered = Gaussian(jax.tree.map(front, begin.mean, track.belief.mean), front(begin.cov, track.belief.cov))
     predicted = jax.tree.map(lambda a: front(a[0], a), track.predicted)  # the first one is not looked at
-    return smooth(RETRACTION, filtered, predicted, later)
+    breaks = None
+    if isinstance(filter, ResettingFilter):
+        anew = [info.status == RESET for info in track.infos]
+        breaks = front(jnp.asarray(False), jnp.any(jnp.stack(anew), axis=0))
+    return smooth(filter.retraction, filtered, predicted, later, breaks)
 
 
 class Record:
     """A timeline with its measurements, cut into padded chunks; `used` (m,) says which epochs enter."""
 
-    def __init__(self, timeline: Timeline, epochs: Epochs, levels: NoiseLevels, used: np.ndarray):
+    def __init__(
+        self, timeline: Timeline, epochs: Epochs, levels: NoiseLevels, used: np.ndarray, design: Design | None = None
+    ):
         self.timeline, self.epochs, self.levels = timeline, epochs, levels
+        self.design = design or Design()
         self.steps = len(timeline.time) - 1
         self.chunks = max(1, -(-self.steps // CHUNK))
         self.used = used
@@ -112,18 +162,51 @@ class Record:
         if self.single and e.star_B is not None and e.star_N is not None:
             star_B, star_N = jnp.asarray(e.star_B[j][:, None]), jnp.asarray(e.star_N[j][:, None])
             m = (*m, Measurement(star_B, star_N, jnp.asarray((present & ~solved)[:, None])))
-        return GyroInput(jnp.asarray(rate), jnp.asarray(extra)), jnp.asarray(dt), m
+        lost = np.pad(t.lost[a:b], (0, pad))
+        if self.design.states == "rate":
+            # Of a step that is no length at all there is no rate.
+            cov = self.levels.sigma_v**2 / np.maximum(dt, 1e-9)[:, None, None] * np.eye(3)
+            there = (~lost & (dt > 0.0))[:, None]
+            m = (Measurement(jnp.asarray(rate), jnp.asarray(cov), jnp.asarray(there)), *m)
+        drifts = jnp.asarray(np.where(lost, 0.0, 1.0)) if self.design.commanded else None
+        return GyroInput(jnp.asarray(rate), jnp.asarray(extra), drifts), jnp.asarray(dt), m
 
     def length(self, i: int) -> int:
         """Real steps of chunk i."""
         return min(CHUNK, self.steps - i * CHUNK)
 
 
-def initial_belief(start: Start) -> Gaussian:
-    """The filter's belief at the first instant."""
-    P = np.zeros((6, 6))
-    P[:3, :3], P[3:, 3:] = start.attitude_cov, np.diag(start.drift_sigma**2)
-    return Gaussian(AttitudeDrift(jnp.asarray(start.q_BN), jnp.asarray(start.drift)), jnp.asarray(P))
+def initial_belief(start: Start, design: Design, rate: np.ndarray) -> Any:
+    """The filter's belief at the first instant; `rate` (3,) is the body's then, for designs that have it as a state."""
+    q, b = jnp.asarray(start.q_BN), jnp.asarray(start.drift)
+    variances = [start.drift_sigma**2]
+    mean: Any = AttitudeDrift(q, b)
+    if design.states == "calibration":
+        mean = AttitudeCalibration(q, b, jnp.zeros(3), jnp.zeros(3))
+        sigma = np.zeros(6) if design.calibration is None else design.calibration
+        variances.append(np.maximum(sigma, LEAST_SIGMA) ** 2)
+    elif design.states == "rate":
+        mean = AttitudeRateDrift(q, jnp.asarray(rate - start.drift), b)
+        variances.insert(0, start.drift_sigma**2 + design.rate_sigma**2)
+    beside = np.concatenate(variances)
+    P = np.zeros((3 + len(beside),) * 2)
+    P[:3, :3], P[3:, 3:] = start.attitude_cov, np.diag(beside)
+    if design.restart is None:
+        return Gaussian(mean, jnp.asarray(P))
+    fresh = beside.copy()
+    fresh[(3 if design.states == "rate" else 0) :][:3] = design.restart**2
+    return ResettableBelief(mean, jnp.asarray(P), jnp.asarray(np.diag(fresh)), jnp.asarray(0))
+
+
+def final_sigma(record: Record, start: Start, gate: Gate) -> np.ndarray:
+    """1 sigma (dim,) of every state at the record's end by a forward pass: the bound, at the rates that were measured."""
+    model, filter = model_of(record.levels, record.single, record.design), record.design.filter
+    belief = initial_belief(start, record.design, record.timeline.rate[0])
+    refused = jnp.zeros(len(model.sensors), dtype=int)
+    for i in range(record.chunks):
+        u, dt, m = record.chunk(i)
+        belief, refused, _ = _forward(filter, model, belief, refused, u, dt, m, gate)
+    return np.sqrt(np.maximum(np.diagonal(np.asarray(belief.cov)), 0.0))
 
 
 def filter_and_smooth(
@@ -133,16 +216,18 @@ def filter_and_smooth(
 
     `advance` is called after each chunk of both passes (2 * record.chunks times).
     """
-    model = model_of(record.levels, record.single)
-    belief, refused = initial_belief(start), jnp.zeros(len(model.sensors), dtype=int)
-    begins, kept, infos = [], [_first(belief)], []
+    design = record.design
+    model, filter = model_of(record.levels, record.single, design), design.filter
+    belief = initial_belief(start, design, record.timeline.rate[0])
+    refused = jnp.zeros(len(model.sensors), dtype=int)
+    begins, kept, infos = [], [_first(belief, design)], []
     for i in range(record.chunks):
         begins.append((belief, refused))
         u, dt, m = record.chunk(i)
-        belief, refused, track = _forward(model, belief, refused, u, dt, m, gate)
+        belief, refused, track = _forward(filter, model, belief, refused, u, dt, m, gate)
         n = record.length(i)
-        kept.append(_numbers(track.belief, n))
-        infos.append(_info(track.infos, n))
+        kept.append(_numbers(track.belief, n, design))
+        infos.append(_info(track.infos[1 if design.states == "rate" else 0 :], n))
         advance()
     filtered = _joined(kept)
     smoothed = _smooth(record, model, begins, belief, gate, advance)
@@ -152,31 +237,40 @@ def filter_and_smooth(
 def _smooth(
     record: Record, model: Model, begins: list, end: Gaussian, gate: Gate, advance: Callable[[], None]
 ) -> Estimates:
-    later, parts = end, []
+    design, filter = record.design, record.design.filter
+    later, parts = Gaussian(end.mean, end.cov), []
     for i in reversed(range(record.chunks)):
         belief, refused = begins[i]
         u, dt, m = record.chunk(i)
-        _, _, track = _forward(model, belief, refused, u, dt, m, gate)
-        smoothed = _backward(belief, track, later)
-        q, b, P = _numbers(smoothed, record.length(i) + 1)
-        parts.append((q[1:], b[1:], P[1:]))
+        _, _, track = _forward(filter, model, belief, refused, u, dt, m, gate)
+        smoothed = _backward(filter, belief, track, later)
+        parts.append(tuple(a[1:] for a in _numbers(smoothed, record.length(i) + 1, design)))
         later = Gaussian(jax.tree.map(lambda a: a[0], smoothed.mean), smoothed.cov[0])
         advance()
-    parts.append(_first(later))
+    parts.append(_first(later, design))
     return _joined(parts[::-1])
 
 
-def _numbers(belief: Any, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return np.asarray(belief.mean.q_BN)[:n], np.asarray(belief.mean.b)[:n], np.asarray(belief.cov)[:n]
+Numbers = tuple[np.ndarray, ...]
+"""Attitude, drift, the covariance of these, and of a calibration its six numbers and their sigma."""
 
 
-def _first(belief: Gaussian) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return np.asarray(belief.mean.q_BN)[None], np.asarray(belief.mean.b)[None], np.asarray(belief.cov)[None]
+def _numbers(belief: Any, n: int, design: Design) -> Numbers:
+    P = np.asarray(belief.cov)[:n]
+    out = (np.asarray(belief.mean.q_BN)[:n], np.asarray(belief.mean.b)[:n], P[:, design.six][:, :, design.six])
+    if design.states != "calibration":
+        return out
+    found = np.concatenate([np.asarray(belief.mean.misalignment)[:n], np.asarray(belief.mean.scale)[:n]], axis=1)
+    return (*out, found, np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2)[:, 6:], 0.0)))
 
 
-def _joined(parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Estimates:
-    q, b, P = (np.concatenate(x) for x in zip(*parts, strict=True))
-    return Estimates(continuous(q), b, P)
+def _first(belief: Any, design: Design) -> Numbers:
+    return _numbers(jax.tree.map(lambda a: jnp.asarray(a)[None], belief), 1, design)
+
+
+def _joined(parts: list[Numbers]) -> Estimates:
+    q, *rest = (np.concatenate(x) for x in zip(*parts, strict=True))
+    return Estimates(continuous(q), *rest)
 
 
 def _info(infos: tuple[Any, ...], n: int) -> tuple[np.ndarray, ...]:

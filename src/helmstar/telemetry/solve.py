@@ -6,15 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core import ACCEPTED, FORCED, Gate, chi_square_gate, no_gate
+from ..core import ACCEPTED, FORCED, RESET, Gate, chi_square_gate, no_gate
 from ..errors import ConfigurationError, DataError
-from ..io.problems import Problem, for_one, refuse
+from ..io.problems import Kind, Problem, for_one, refuse
 from ..io.screening import screen_gyro
 from ..io.telemetry import AttitudeRows, GyroRows, Telemetry, to_rates
 from ..progress import Progress
 from ..sensors.configuration import SensorsConfiguration
 from ..units import ARCSEC
-from .estimate import Estimates, Record, Start, Updates, filter_and_smooth
+from .calibration import Calibration, corrected, in_gyro_axes, observed, rough_calibration
+from .estimate import Design, Estimates, Record, Start, Updates, filter_and_smooth, final_sigma
+from .loss import with_policy
 from .noise import ENOUGH, NAMES, NoiseLevels, estimate_noise, rough_levels
 from .rates import RateSignal, rate_signal
 from .series import bring_back
@@ -44,6 +46,7 @@ class Solution:
     start: Start
     problems: tuple[Problem, ...]
     gate: Gate
+    calibration: Calibration | None = None
 
 
 def solve(
@@ -74,7 +77,7 @@ def _solve(telemetry: Telemetry, sensors: SensorsConfiguration, strict: bool, pr
 
     def check() -> None:
         if strict:
-            refuse([p for p in problems if p.action != NOT_USED])
+            refuse(problems)
 
     with Progress(progress) as bar:
         task = bar.add("reading", 1)
@@ -82,25 +85,97 @@ def _solve(telemetry: Telemetry, sensors: SensorsConfiguration, strict: bool, pr
         check()
         epochs = _within(signal, epochs, problems)
         bar.finish(task)
-        task = bar.add("start and noise", 2)
+        task = bar.add("start and noise", 1)
         gate = _gate(sensors)
-        epochs, used, beginning, levels, sources = _begin(signal, epochs, sensors, gate, problems)
-        bar.advance(task)
-        start, start_sources = _start(sensors, epochs, levels, beginning)
-        timeline = build_timeline(signal, epochs)
+        ready, calibration = _calibrated(signal, epochs, sensors, gate)
+        problems += ready.problems
+        record, epochs = ready.record, ready.record.epochs
         bar.finish(task)
-        record = Record(timeline, epochs, levels, used)
         task = bar.add("filter and smoother", 2 * record.chunks)
-        filtered, smoothed, updates = filter_and_smooth(record, start, gate, lambda: bar.advance(task))
+        filtered, smoothed, updates = filter_and_smooth(record, ready.start, gate, lambda: bar.advance(task))
         bar.finish(task)
     if not all(np.isfinite(x).all() for e in (filtered, smoothed) for x in (e.q_BN, e.drift, e.cov)):
         raise DataError("the filter did not stay finite; check the noise in sensors.toml against the data's units")
-    problems += _refused(timeline, epochs, updates, gate)
+    problems += _refused(record.timeline, epochs, updates, gate)
     check()
+    if calibration is not None:
+        filtered, smoothed = (in_gyro_axes(e, calibration.rough) for e in (filtered, smoothed))
     return Solution(
-        gyro, timeline, epochs, used, filtered, smoothed, updates, levels, sources | start_sources, start,
-        tuple(problems), gate,
+        gyro, record.timeline, epochs, record.used, filtered, smoothed, updates, record.levels, ready.sources,
+        ready.start, tuple(problems), gate, calibration,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Ready:
+    """What the filter is given, where its numbers come from, and what was wrong with the attitudes."""
+
+    record: Record
+    start: Start
+    sources: dict[str, str]
+    problems: list[Problem]
+
+
+def _ready(
+    signal: RateSignal, epochs: Epochs, sensors: SensorsConfiguration, gate: Gate, calibration: np.ndarray
+) -> _Ready:
+    """Start, noise and timeline of a record; `calibration` (6,): prior sigma of what is estimated beside the drift."""
+    problems: list[Problem] = []
+    signal = with_policy(signal, sensors.gyro)
+    epochs, used, beginning, levels, sources = _begin(signal, epochs, sensors, gate, problems)
+    start, start_sources = _start(sensors, epochs, levels, beginning)
+    timeline = build_timeline(signal, epochs)
+    record = Record(timeline, epochs, levels, used, _design(sensors, timeline, calibration))
+    return _Ready(record, start, sources | start_sources, problems)
+
+
+def _calibrated(
+    signal: RateSignal, epochs: Epochs, sensors: SensorsConfiguration, gate: Gate
+) -> tuple[_Ready, Calibration | None]:
+    """The record made ready, with what the record does not show of a calibration left out: bound first, estimate then."""
+    prior = sensors.calibrate.sigma
+    if not prior.any():
+        return _ready(signal, epochs, sensors, gate, prior), None
+    bound, shown = prior, prior > 0.0
+    while True:
+        active = np.where(shown, prior, 0.0)
+        rough = rough_calibration(signal, epochs, active) if shown.any() else np.zeros(6)
+        ready = _ready(corrected(signal, rough), epochs, sensors, gate, active)
+        if not shown.any():
+            return ready, Calibration(prior, rough, bound, shown)
+        found = final_sigma(ready.record, ready.start, gate)[6:]
+        bound = np.where(shown, found, bound)  # of what was left out it stays what it was when that was decided
+        still = shown & observed(prior, bound)
+        if np.array_equal(still, shown):
+            return ready, Calibration(prior, rough, bound, shown)
+        shown = still
+
+
+def _design(sensors: SensorsConfiguration, timeline: Timeline, calibration: np.ndarray) -> Design:
+    """Which states are estimated, as the configuration asks; `calibration` (6,) as for `_ready`."""
+    rated = sensors.gyro.loss_policy == "rate_state"
+    rate_sigma = 0.0
+    if rated:
+        given = sensors.gyro.rate_sigma_deg_s
+        rate_sigma = _liveliness(timeline) if given is None else float(np.radians(given))
+    return Design(
+        states="calibration" if sensors.calibrate.sigma.any() else "rate" if rated else "drift",
+        calibration=calibration,
+        rate_sigma=rate_sigma,
+        restart=float(np.radians(sensors.filter.restart_drift_sigma_deg_h) / 3600.0)
+        if sensors.filter.restart
+        else None,
+        commanded=sensors.gyro.loss_policy == "commanded",
+    )
+
+
+def _liveliness(timeline: Timeline) -> float:
+    """Random walk of the rate, rad/s/sqrt(s), that is as large as the fastest of the changes that the record shows: a
+    smaller one would take a slew for bad gyro rows."""
+    dt = np.diff(timeline.time)
+    clean = ~(timeline.lost[1:] | timeline.lost[:-1]) & (dt[1:] > 0.0) & (dt[:-1] > 0.0)
+    change = np.linalg.norm(np.diff(timeline.rate, axis=0), axis=1)[clean] / np.sqrt(dt[1:][clean])
+    return float(np.max(change, initial=1e-6))
 
 
 def _gate(sensors: SensorsConfiguration) -> Gate:
@@ -183,7 +258,7 @@ def _within(signal: RateSignal, epochs: Epochs, problems: list[Problem]) -> Epoc
     return epochs.select(reach & ~early)
 
 
-def _note(problems: list[Problem], epochs: Epochs, which: np.ndarray, kind: str, message: str) -> None:
+def _note(problems: list[Problem], epochs: Epochs, which: np.ndarray, kind: Kind, message: str) -> None:
     """One entry for each file that has epochs in a mask, which are good but of no use."""
     for i in np.unique(epochs.file[which]):
         row = epochs.row[which & (epochs.file == i)]
@@ -259,7 +334,9 @@ def _refused(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate) -
         where = f"{off:.4g} arcsec from what the gyro leads to, " if np.isfinite(off) else ""
         limit = limits[updates.dof[k]]
         message = f"a jump: {where}NIS {updates.nis[k]:.4g} over the gate's {limit:.4g}"
-        action = "used, its sigma enlarged" if updates.status[k] == FORCED else "dropped"
+        action = {FORCED: "used, its sigma enlarged", RESET: "the filter was restarted from it"}.get(
+            int(updates.status[k]), "dropped"
+        )
         out.append(Problem(epochs.files[epochs.file[e]], int(epochs.row[e]), "jump", message, action))
     return out
 

@@ -60,12 +60,13 @@ def attitude_epochs(rows: AttitudeRows, shape: np.ndarray) -> Epochs:
 class Timeline:
     """time (n + 1,): the start and the end of each of n steps. rate (n, 3): mean rate in B over a step; extra (n, 3): added
     attitude variance of a step, rad^2 about each axis. epoch (n + 1,): number of the star epoch at each time, -1 for
-    none; time[0] is that of the first epoch."""
+    none; time[0] is that of the first epoch. lost (n,): steps within a gap of the gyro."""
 
     time: np.ndarray
     rate: np.ndarray
     extra: np.ndarray
     epoch: np.ndarray
+    lost: np.ndarray
 
 
 SAME_INSTANT_S = 1e-9
@@ -90,4 +91,5 @@ def build_timeline(signal: RateSignal, epochs: Epochs) -> Timeline:
     grid = np.delete(grid, drop[~is_star[drop]])
     epoch = np.full(len(grid), -1)
     epoch[np.searchsorted(grid, times)] = np.arange(len(times))
-    return Timeline(grid, signal.mean_rates(grid), signal.gap_variance(grid), epoch)
+    lost = signal.gap[signal.piece(0.5 * (grid[:-1] + grid[1:]))]
+    return Timeline(grid, signal.mean_rates(grid), signal.gap_variance(grid), epoch, lost)
