@@ -139,6 +139,7 @@ def test_damaged_tables_and_odd_configurations(tmp_path, star, cells, columns, r
     keys=st.sampled_from(["", *EXTREMES]),
 )
 @example(jump_s=1e8, step_s=1.0, rate=1e-5, pattern="random", attitude="still", keys="")
+@example(jump_s=1e14, step_s=1.0, rate=0.05, pattern="random", attitude="still", keys="")
 @example(jump_s=0.0, step_s=1.0, rate=900.0, pattern="alternating", attitude="still", keys="")
 @example(jump_s=0.0, step_s=1.0, rate=900.0, pattern="random", attitude="still", keys="")
 @example(jump_s=0.0, step_s=2.0 * np.pi * 20, rate=0.05, pattern="constant", attitude="still", keys="")
