@@ -97,8 +97,9 @@ def run_allan(
     """The whole command: returns the object of `--json` and the report's path. Raises HelmstarError."""
     sensors = load_sensors(config)
     telemetry = read_telemetry(
-        files, sensors.columns or None, strict=strict, needs=("gyro",), offsets=sensors.time_offsets
-    )
+        files, sensors.columns or None, strict=strict, needs=("gyro",), offsets=sensors.time_offsets,
+        settings=sensors.formats(None if config is None else Path(config).parent),
+    )  # fmt: skip
     file = ", ".join(str(f) for f in files)
     series, axes, basis, problems, gaps = _best_basis(telemetry, sensors, file, strict)
     if strict:
