@@ -109,12 +109,10 @@ def polish(d: c.Directions, B: c.Matrix, q: c.Quaternion, frame: c.Turn | None =
     sum w f x (b - f) about the fitted directions f = R r does not: b - f is exact, so what is left is the rounding of the
     directions over their spread, the least possible.
 
-    Hessian: tr(B R^T) I - sym(B R^T). Beside the valley's floor, with weights far apart, it is not positive; there Gauss and
-    Newton's sum w (I - f f^T) takes its place, which always is.
+    Hessian: tr(B R^T) I - sym(B R^T). The step is taken where it is not positive, too: with weights far apart that is so beside
+    the valley's floor, and it leads back there.
     """
     xp = d.xp
-
-    C, det_M, _ = c.information(d.w, d.r)
 
     def step(q: c.Quaternion) -> c.Quaternion:
         q = c.unit(q, xp)
@@ -129,13 +127,8 @@ def polish(d: c.Directions, B: c.Matrix, q: c.Quaternion, frame: c.Turn | None =
         xy, xz, yz = -0.5 * (A[0][1] + A[1][0]), -0.5 * (A[0][2] + A[2][0]), -0.5 * (A[1][2] + A[2][1])
         H = ((A[1][1] + A[2][2], xy, xz), (xy, A[0][0] + A[2][2], yz), (xz, yz, A[0][0] + A[1][1]))
         adj = c.cofactors(H)
-        det = c.dot(H[0], adj[0])
-        sound = det > 0.01 * det_M
-        twice = 2.0 * xp.where(sound, det, det_M)
-        A = [c.apply(C, row) for row in R]
-        xx, xy, xz, yy, yz, zz = (xp.where(sound, adj[j][k], c.dot(A[j], R[k])) for j, k in c.UPPER)
-        inverse = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
-        u = (c.dot(inverse[0], g) / twice, c.dot(inverse[1], g) / twice, c.dot(inverse[2], g) / twice)
+        twice = 2.0 * c.dot(H[0], adj[0])
+        u = (c.dot(adj[0], g) / twice, c.dot(adj[1], g) / twice, c.dot(adj[2], g) / twice)
         x, y, z, w = q
         v = c.cross(u, (x, y, z))
         return x + w * u[0] + v[0], y + w * u[1] + v[1], z + w * u[2] + v[2], w - c.dot(u, (x, y, z))
