@@ -33,6 +33,12 @@ def test_set_takes_toml_values_and_bare_words(text, value):
     assert parse_set([text]) == {"a.b": value}
 
 
+@pytest.mark.parametrize(("key", "value"), [("gyro.loss_s", "60"), ("star.loss_s", True), ("tuning.reset_after", 2.0)])
+def test_every_scenarios_tables_take_numbers_of_their_type_only(key, value):
+    with pytest.raises(ConfigurationError, match=key):
+        load("zhou2021", {key: value})
+
+
 def test_a_whole_number_is_a_number():
     assert load("xu2020", {"star.sigma_arcsec": 5})[1].star.sigma_arcsec == 5.0
 

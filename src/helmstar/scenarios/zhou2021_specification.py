@@ -19,7 +19,7 @@ POLICIES = ("zeros", "hold_last", "hold_mean", "hold_mean_raised", "commanded", 
 
 
 class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class Orbit(_Table):
