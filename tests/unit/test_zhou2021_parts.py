@@ -435,3 +435,41 @@ def test_the_predictive_filter_is_the_minimum_of_its_cost():
     moved = np.asarray(model.retraction.boxminus(found.mean, b.mean))
     np.testing.assert_allclose(moved, np.asarray(G) @ d, atol=1e-9 * np.abs(d).max() + 1e-18)
     assert np.linalg.norm(moved[:3]) > 1e-4
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+def test_the_command_prints_one_object_of_the_stated_shape(capsys, tmp_path):
+    import json
+
+    from helmstar.cli import main
+
+    keys = ["--set", "duration_s=600", "--set", "width=2", "--set", "gyro.loss_start_s=200"]
+    code = main(
+        ["run", "zhou2021", "--runs", "2", "--estimators", "quest_ekf", *keys, "--out", str(tmp_path), "--json"]
+    )
+    out = capsys.readouterr().out
+    assert code == 0
+
+    def no_constant(name):
+        raise AssertionError(name)
+
+    result = json.loads(out, parse_constant=no_constant)
+    assert (result["scenario"], result["runs"]) == ("zhou2021", 2)
+    m = result["estimators"]["quest_ekf"]
+    assert m.keys() == {
+        "attitude_rms_deg", "drift_rms_deg_h", "nees_mean", "nees_in_band", "sign_errors", "resets", "rms_over_bound",
+        "drift_rms_over_bound", "outage_peak_deg", "star_loss_deg", "recovery_s", "us_per_step",
+    }  # fmt: skip
+    assert set(m["outage_peak_deg"]) == {
+        "none", "zeros", "hold_last", "hold_mean", "hold_mean_raised", "commanded", "both_lost",
+    }  # fmt: skip
+    assert m["recovery_s"]["start_179deg"]["runs"] == 2
+    assert m["star_loss_deg"] == {}  # 450 s after 200 s have no room in 600 s
+    assert (tmp_path / "report.html").stat().st_size > 1e6
+    code = main(["run", "zhou2021", "--runs", "2", "--estimators", "quest_ekf", *keys, "--out", str(tmp_path / "two")])
+    text = capsys.readouterr().out
+    assert code == 0
+    assert "quest_ekf" in text
+    assert max(map(len, text.splitlines()[:-1])) <= 100

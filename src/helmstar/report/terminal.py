@@ -40,8 +40,8 @@ def print_campaign(summary: dict[str, Any]) -> None:
 def _print_attitude_and_drift(summary: dict[str, Any]) -> None:
     runs = summary["runs"]
     print(f"{summary['scenario']}: {runs} runs, seed {summary['seed']}, {summary['wall_s']:.1f} s")
-    heads = ("estimator", "attitude deg", "drift deg/h", "NEES/6", "signs", "loss: mean held", "179 deg off")
-    widths = (22, 14, 13, 8, 7, 17, 13)
+    heads = ("estimator", "attitude deg", "drift deg/h", "NEES/6", "signs", "loss deg", "179 deg")
+    widths = (20, 14, 13, 9, 8, 11, 10)
     print(
         "".join(
             h.ljust(w) if i == 0 else h.rjust(w) for i, (h, w) in enumerate(zip(heads, widths, strict=True))
@@ -60,10 +60,9 @@ def _print_attitude_and_drift(summary: dict[str, Any]) -> None:
             f"{case['converged']}/{case['runs']}" if case and name != "smoother" else "-",
         )
         print("".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))))
-    print("attitude, drift: RMS of the last 1000 s, worst axis; NEES/6: 1 when consistent; signs: updates with the")
-    print(
-        "wrong sign; loss: median peak error, gyro lost for a minute; 179 deg off: runs that recover from such a start"
-    )
+    print("attitude, drift: RMS of the last 1000 s, worst axis; NEES/6: 1 when consistent;")
+    print("signs: updates with the wrong sign; loss: median peak error, gyro lost for a minute, mean held;")
+    print("179 deg: runs that recover from a start so far off within 300 s")
 
 
 def print_attitude(result: dict[str, Any]) -> None:
