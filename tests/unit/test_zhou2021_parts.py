@@ -246,6 +246,27 @@ def test_wrong_keys_are_named(key, value, words):
         assert word in str(e.value)
 
 
+def test_heads_that_see_nothing_at_the_start_are_an_error():
+    from helmstar.scenarios.specification import build
+
+    _, spec = load("zhou2021", {"duration_s": 100, "star.field_deg": 0.5})
+    with pytest.raises(ConfigurationError, match=r"star.field_deg = 0.5.* 0 stars at the start"):
+        build("zhou2021", spec)
+
+
+def test_stars_that_come_and_go_are_part_of_the_scenario():
+    """With a narrow field an epoch may have one star or none; bound and designs go on."""
+    from helmstar.scenarios.specification import build
+    from helmstar.scenarios.zhou2021_results import design_table, scenario_bound
+
+    _, spec = load("zhou2021", {"duration_s": 1500, "star.field_deg": 8.0, "star.faintest": 5.0})
+    experiment = build("zhou2021", spec)
+    counts = experiment.truth.seen.sum(axis=1)
+    assert set(counts) > {1, 2}
+    assert np.isfinite(scenario_bound(experiment)).all()
+    assert all(np.isfinite(v).all() for k, v in design_table(experiment).items() if k != "reading")
+
+
 # --- models ----------------------------------------------------------------------------------------------------------
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..core import Gate, Model, chi_square_gate, no_gate
+from ..errors import ConfigurationError
 from ..filters import (
     AdaptiveFilter,
     ErrorStateKalmanFilter,
@@ -90,6 +91,11 @@ class Experiment:
         self.title = spec.title
         self.width = spec.width
         self.truth = truth_of(spec)
+        if self.truth.seen[0].sum() < 2:
+            raise ConfigurationError(
+                f"star.field_deg = {spec.star.field_deg:g}, star.faintest = {spec.star.faintest:g}: the heads see "
+                f"{int(self.truth.seen[0].sum())} stars at the start, which needs two; widen the field or take fainter stars"
+            )
         self.timeline = build_timeline(spec)
         self.update = np.arange(EVERY, spec.duration_s + 1, EVERY)
         self.time = self.update.astype(float)

@@ -148,7 +148,8 @@ def design_table(experiment: Experiment, last_s: int = 1000) -> dict[str, np.nda
     bound = bounds_of(experiment, sigma, sigma_v, sigma_u)[-last_s:]
     worst = np.sqrt(np.mean(np.diagonal(bound, axis1=2, axis2=3), axis=0).reshape(-1, 2, 3).max(axis=2))
     # Of the worst axis of one epoch's solution, on average over the orbit.
-    axis = np.sqrt(np.mean(np.diagonal(np.linalg.inv(information(experiment, 1.0)), axis1=1, axis2=2), axis=0).max())
+    alone = np.linalg.inv(information(experiment, 1.0)[experiment.truth.seen.sum(axis=1) > 1])
+    axis = np.sqrt(np.mean(np.diagonal(alone, axis1=1, axis2=2), axis=0).max())
     steady = farrenkopf(sigma * axis, sigma_v, sigma_u, 1.0)
     attitude, drift = np.degrees(worst[:, 0]), worst[:, 1] / DEG_H
     return {

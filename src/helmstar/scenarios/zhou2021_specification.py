@@ -10,9 +10,10 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from ..units import ARCSEC
 from .specification import ScenarioSpecification
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+# Far wider than any use: only so that squares and quotients of the numbers keep their digits.
+Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Positive = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 READINGS = {"A": np.sqrt(0.002), "B": 0.002, "C": np.deg2rad(np.sqrt(0.002)), "D": np.deg2rad(0.002)}
 """Sigma in rad per component of a direction, for each reading of "error covariance 0.002 I"."""
 POLICIES = ("zeros", "hold_last", "hold_mean", "hold_mean_raised", "commanded", "rate_state")
@@ -23,8 +24,8 @@ class _Table(BaseModel):
 
 
 class Orbit(_Table):
-    semi_major_axis_km: Annotated[float, Field(gt=6378.2, allow_inf_nan=False)]
-    eccentricity: Annotated[float, Field(ge=0, lt=1)]
+    semi_major_axis_km: Annotated[float, Field(gt=6378.2, le=1e6, allow_inf_nan=False)]
+    eccentricity: Annotated[float, Field(ge=0, le=0.99)]
     inclination_deg: Annotated[float, Field(ge=0, le=180)]
     raan_deg: Finite
     argument_of_perigee_deg: Finite
@@ -41,8 +42,8 @@ class Orbit(_Table):
 class Attitude(_Table):
     profile: Literal["lvlh", "yaw", "slew", "file"]
     slew_deg: Annotated[float, Field(ge=0, le=360)]
-    slew_s: Positive
-    slew_every_s: Positive
+    slew_s: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
+    slew_every_s: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
     sun: Annotated[list[Finite], Field(min_length=3, max_length=3)]
     file: str | None = None
 
@@ -68,7 +69,7 @@ class Star(_Table):
     field_deg: Annotated[float, Field(gt=0, le=120)]
     faintest: Annotated[float, Field(ge=2, le=9)]
     reading: Literal["A", "B", "C", "D"]
-    sigma_arcsec: Positive | None = None
+    sigma_arcsec: Annotated[float, Field(ge=1e-3, le=1e5, allow_inf_nan=False)] | None = None
     loss_start_s: NonNegative
     loss_s: NonNegative
 
@@ -83,19 +84,19 @@ class Gyro(_Table):
     rrw_deg_h_sqrt_h: NonNegative
     initial_drift_sigma_deg_h: Positive
     loss_start_s: NonNegative
-    loss_s: Positive
+    loss_s: Annotated[float, Field(ge=1, le=1e5, allow_inf_nan=False)]
     loss_policy: Literal["none", "zeros", "hold_last", "hold_mean", "hold_mean_raised", "commanded", "rate_state"]
-    hold_s: Annotated[float, Field(ge=1, allow_inf_nan=False)]
+    hold_s: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
     raised_deg_s: Positive
     command_error: Annotated[float, Field(gt=-1, lt=1)]
 
 
 class Tuning(_Table):
     wrong_start_sigma_deg: Positive
-    reset_probability: Annotated[float, Field(gt=0, lt=1)]
-    reset_after: Annotated[int, Field(ge=1)]
+    reset_probability: Annotated[float, Field(ge=1e-15, le=0.5)]
+    reset_after: Annotated[int, Field(ge=1, le=1_000_000)]
     reset_drift_sigma_deg_h: Positive
-    adaptive_share: Annotated[float, Field(gt=0, lt=1)]
+    adaptive_share: Annotated[float, Field(ge=1e-6, le=0.9)]
     rate_sigma_deg_s: Positive
     recovered_deg: Positive
 
@@ -104,7 +105,7 @@ class Specification(ScenarioSpecification):
     """Every key of a zhou2021 scenario."""
 
     experiment: Literal["zhou2021"]
-    duration_s: Annotated[int, Field(ge=60, le=1_000_000)]
+    duration_s: Annotated[int, Field(ge=60, le=200_000)]  # memory is some 10 kB for each second and 25 runs
     orbit: Orbit
     attitude: Attitude
     star: Star
