@@ -93,7 +93,9 @@ class GyroConfiguration(_Table):
     hold_s: Positive = Field(default=30.0, description="what hold_mean averages")
     raised_deg_s: Positive = Field(default=0.5, description="1 sigma of a rate held with hold_mean_raised")
     commanded_rate_deg_s: Annotated[list[Finite], Field(min_length=3, max_length=3)] | None = None
-    command_error: NotNegative = Field(default=0.01, description="1 sigma of the commanded rate, relative to its length")
+    command_error: NotNegative = Field(
+        default=0.01, description="1 sigma of the commanded rate, relative to its length"
+    )
     rate_sigma_deg_s: Positive | None = Field(
         default=None, description="rate_state: random walk of the rate, deg/s/sqrt(s); None: what the record shows"
     )
