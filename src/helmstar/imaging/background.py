@@ -1,0 +1,102 @@
+"""The sky and its noise on a mesh of tiles, in units of a filtered image, from a sample of its pixels.
+
+Median and upper quantiles of each tile, smoothed by the median of 3 x 3 tiles so that no star or planet lifts its own
+threshold, and interpolated bilinearly. The noise is what the upper side of the distribution shows: a sensor with
+thousands of hot pixels, or one whose zero hides the lower half, then has the noise that makes false stars.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+PER_TILE = 16
+"""Samples along the side of a tile."""
+_QUANTILES = ((0.8413, 1.0), (0.9332, 1.5))  # of a normal distribution, and how many sigma they lie above the median
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """sky, noise: (tile rows, tile columns), the median and one sigma, of an image of that shape (height, width)."""
+
+    sky: np.ndarray
+    noise: np.ndarray
+    shape: tuple[int, int]
+
+    def limit(self, sigmas: float, every: int) -> np.ndarray:
+        """Sky plus so many sigma, for each block of `every` rows, the last one perhaps shorter: (blocks, width)."""
+        middles = np.arange(0, self.shape[0], every) + (every - 1) / 2
+        return between(self.sky + np.float32(sigmas) * self.noise, self.shape, middles, np.arange(self.shape[1]))
+
+    def at(self, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sky and noise (n,) at rows and columns (n,)."""
+        (i, a), (j, b) = (_place(p, size, n) for p, size, n in zip((y, x), self.shape, self.sky.shape))
+        both = []
+        for mesh in (self.sky, self.noise):
+            m = np.pad(mesh, ((0, 1), (0, 1)), mode="edge")
+            left, right = m[i, j] + a * (m[i + 1, j] - m[i, j]), m[i, j + 1] + a * (m[i + 1, j + 1] - m[i, j + 1])
+            both.append(left + b * (right - left))
+        return both[0], both[1]
+
+
+def _place(at: np.ndarray, size: int, tiles: int) -> tuple[np.ndarray, np.ndarray]:
+    """The tile before each position and the fraction of the way to the next one's middle; flat beyond the outer middles."""
+    place = np.clip((at + 0.5) * (tiles / size) - 0.5, 0.0, tiles - 1.0)
+    tile = place.astype(np.intp)
+    return tile, (place - tile).astype(np.float32)
+
+
+def between(mesh: np.ndarray, shape: tuple[int, int], y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """A mesh interpolated bilinearly on the grid of rows y and columns x: (rows, columns), float32.
+
+    Not by matrix products, whose threads cost more than the work when a processor is shared.
+    """
+    for at, size in ((x, shape[1]), (y, shape[0])):
+        m = np.ascontiguousarray(mesh.T)  # so that the axis to interpolate leads: columns, then rows
+        tile, part = _place(at, size, len(m))
+        m = np.concatenate([m, m[-1:]])
+        mesh = np.diff(m, axis=0)[tile]
+        mesh *= part[:, None]
+        mesh += m[tile]
+    return mesh
+
+
+def mesh_of(sample: np.ndarray, shape: tuple[int, int], tile: int, floor: float) -> Mesh:
+    """The mesh of an image of that shape from a regular sample of it (any strides), tiles of about `tile` pixels.
+
+    floor: the noise of rounding to whole numbers. An image of nearly nothing but zeros shows less, and then a third of it holds.
+    """
+    tiles = [max(1, round(n / tile)) for n in shape]
+    picks = []
+    for n, s in zip(tiles, sample.shape):
+        picks.append(np.minimum((np.arange(n * PER_TILE) + 0.5) * (s / (n * PER_TILE)), s - 1).astype(int))
+    values = sample[picks[0]][:, picks[1]].astype(np.float32)
+    count = PER_TILE**2
+    sky = _over_neighbours(np.sort(_by_tile(values, tiles), axis=-1)[..., count // 2])
+    at = [(p + 0.5) * (size / s) - 0.5 for p, size, s in zip(picks, shape, sample.shape)]
+    smooth = between(sky, shape, *at)
+    rest = np.sort(_by_tile(values - smooth, tiles), axis=-1)
+    middle = rest[..., count // 2]
+    spread = [(rest[..., int(q * count)] - middle) / k for q, k in _QUANTILES]
+    # Where sky and noise round to zero, one count in a thousand pixels is rare and tells: the spread cannot see that.
+    tail = rest.ravel()
+    rare = np.partition(tail, int(0.999 * tail.size))[int(0.999 * tail.size)] / 3.09
+    noise = np.maximum(_over_neighbours(np.maximum(*spread)), np.clip(rare, 0.35 * floor, floor))
+    return Mesh(sky=sky + _over_neighbours(middle), noise=noise.astype(np.float32), shape=shape)
+
+
+def _by_tile(values: np.ndarray, tiles: list[int]) -> np.ndarray:
+    """(tile rows, tile columns, samples of the tile)."""
+    v = values.reshape(tiles[0], PER_TILE, tiles[1], PER_TILE)
+    return v.transpose(0, 2, 1, 3).reshape(tiles[0], tiles[1], PER_TILE**2)
+
+
+def _over_neighbours(mesh: np.ndarray) -> np.ndarray:
+    """Median of 3 x 3 tiles, edges repeated."""
+    p = np.pad(mesh, 1, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(p, (3, 3))
+    return np.sort(windows.reshape(*mesh.shape, 9), axis=-1)[..., 4]
+
+
+__all__ = ["PER_TILE", "Mesh", "between", "mesh_of"]

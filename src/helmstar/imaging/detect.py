@@ -1,0 +1,242 @@
+"""Stars of a real image: places above the noise, each looked at as a star would look, then fitted.
+
+A place is no star if its light is one pixel's (hot pixel) or one row's or column's, if its surroundings are as rough as itself
+(roofs, trees, JPEG blocks), or if it is broader than any star. `detect` has one setting for all cameras.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .centroid import Fit, fit, gain_of
+from .frame import Centroids, Image
+from .pyramid import Peaks, find_peaks, halve
+
+HALF = (3, 5, 9)
+"""Half the side of a star's window at each level, px."""
+_BORDER = 2
+_FOR_WIDTH = 40  # stars whose widths tell the optics
+_WIDTH = (0.8, 1.5, 3.0)  # sigma expected of a star found at each level, px
+
+
+@dataclass(frozen=True)
+class DetectionSettings:
+    """threshold: sigma of the filtered image. max_stars: kept, the brightest. levels: 1 to 3 scales, each twice the one before.
+
+    optics_px: least sigma of a centroid, for what no noise explains (optics are no Gaussians). gain: image counts per
+    photo-electron; None estimates it from the stars' residuals.
+    """
+
+    threshold: float = 5.0
+    max_stars: int = 100
+    levels: int = 3
+    optics_px: float = 0.02
+    gain: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 2.0 <= self.threshold <= 100.0:
+            raise ValueError(f"threshold {self.threshold}: must be 2 to 100 sigma")
+        if not 1 <= self.levels <= 3:
+            raise ValueError(f"levels {self.levels}: must be 1, 2 or 3")
+        if not 1 <= self.max_stars <= 10_000:
+            raise ValueError(f"max_stars {self.max_stars}: must be 1 to 10000")
+
+
+def detect(image: Image, settings: DetectionSettings | None = None, dark: np.ndarray | None = None) -> Centroids:
+    """Stars of an image, the largest flux first, at most `max_stars`. dark: (height, width) subtracted before.
+
+    An image smaller than 16 pixels a side, or of one value, has none. Raises ValueError for a dark of another shape.
+    """
+    s = settings or DetectionSettings()
+    array = image.array
+    if dark is not None:
+        if dark.shape != array.shape:
+            raise ValueError(f"dark of shape {dark.shape}: the image has {array.shape}")
+        array = array.astype(np.float32) - dark.astype(np.float32)
+    if min(array.shape) < 16:
+        return _nothing()
+    if array.dtype != np.uint8:
+        array = array.astype(np.float32)
+    quantum = 1.0 if image.array.dtype.kind == "u" else 0.0
+    quantum = max(quantum, 1e-12)
+    x, y, level, snr, floor = _candidates(array, s, quantum)
+    if not len(x):
+        return _nothing()
+    parts = []
+    for k in range(s.levels):
+        mine = np.flatnonzero(level == k)
+        if mine.size:
+            parts.append(_measure(array, image, x[mine], y[mine], snr[mine], floor[mine], k, s, quantum))
+    whole = Centroids(**{f: np.concatenate([getattr(p, f) for p in parts]) for f in vars(parts[0])})
+    whole = whole.take(np.argsort(-whole.flux, kind="stable"))
+    return whole.take(_alone(whole)[: s.max_stars])
+
+
+def _nothing() -> Centroids:
+    n = np.zeros(0)
+    return Centroids(n, n, n, np.zeros((0, 2, 2)), n, n.astype(bool), n, n)
+
+
+def _candidates(array: np.ndarray, s: DetectionSettings, quantum: float) -> tuple[np.ndarray, ...]:
+    """Places x, y (n,) int in the image, levels, signal over noise and noise of a pixel: the strongest of each neighbourhood."""
+    found: list[tuple[np.ndarray, ...]] = []
+    binned = array
+    for level in range(s.levels):
+        if min(binned.shape) < 40:
+            break
+        peaks = find_peaks(binned, level, s.threshold, quantum)
+        if level == 0:
+            x, y, keep = peaks.x, peaks.y, _wider_than_a_pixel(array, peaks, quantum)
+        else:
+            x, y, keep = _brightest_of(array, peaks, level, s.threshold)
+        snr = peaks.excess[keep] / peaks.noise[keep]
+        floor = peaks.noise[keep] / (6 << level)
+        order = _strongest(snr, 2 * s.max_stars)
+        found.append((x[keep][order], y[keep][order], np.full(order.size, level), snr[order], floor[order]))
+        if level + 1 < s.levels:
+            binned = halve(binned)
+    if not found:
+        return (np.zeros(0, int),) * 5
+    merged = [np.concatenate(c) for c in zip(*found)]
+    order = _strongest(merged[3], 4 * s.max_stars)
+    x, y, level = (c[order] for c in merged[:3])
+    reach = np.array(HALF)[level]
+    near = np.maximum(np.abs(x[:, None] - x), np.abs(y[:, None] - y)) <= reach  # of the stronger one, in the columns
+    first = order[~np.any(np.tril(near, -1), axis=1)][: 3 * s.max_stars // 2]
+    return tuple(c[first] for c in merged)
+
+
+def _strongest(values: np.ndarray, count: int) -> np.ndarray:
+    """Indices of the largest values, the largest first."""
+    return np.argsort(-values, kind="stable")[:count]
+
+
+def _around(array: np.ndarray, x: np.ndarray, y: np.ndarray, half: int) -> np.ndarray:
+    """Windows (n, m, m), float32, edges repeated."""
+    d = np.arange(-half, half + 1)
+    rows = np.clip(y[:, None] + d, 0, array.shape[0] - 1)
+    columns = np.clip(x[:, None] + d, 0, array.shape[1] - 1)
+    return array[rows[:, :, None], columns[:, None, :]].astype(np.float32)
+
+
+def _wider_than_a_pixel(array: np.ndarray, peaks: Peaks, quantum: float) -> np.ndarray:
+    """Which places of level 0 have light beside their brightest pixel, in both directions, as even the sharpest optics give."""
+    w = _around(array, peaks.x, peaks.y, 2)
+    # The filter is 16 times the local mean of light: sky in a pixel from the filtered value's.
+    f = (w[:, 1:4, 1:4] * np.outer([1, 2, 1], [1, 2, 1])).sum(axis=(1, 2))
+    sky = (f - peaks.excess) / 16.0
+    noise = peaks.noise / 6.0
+    w -= sky[:, None, None]
+    n = np.arange(len(w))
+    j, i = np.divmod(np.argmax(w[:, 1:4, 1:4].reshape(len(w), 9), axis=1), 3)
+    j, i = j + 1, i + 1
+    top = w[n, j, i]
+    along_x, along_y = w[n, j, i - 1] + w[n, j, i + 1], w[n, j - 1, i] + w[n, j + 1, i]
+    corners = w[n, j - 1, i - 1] + w[n, j - 1, i + 1] + w[n, j + 1, i - 1] + w[n, j + 1, i + 1]
+    beside = 2 * (along_x + along_y) + corners
+    allowed = 2.0 * np.sqrt(2.0) * noise + quantum  # two pixels may have lost half a count each by rounding
+    return (
+        (beside > np.maximum(2.5 * np.sqrt(20.0) * noise, 0.7 * top) - 3.0 * quantum)
+        & (along_x > 0.16 * top - allowed)
+        & (along_y > 0.16 * top - allowed)
+    )
+
+
+def _brightest_of(array: np.ndarray, peaks: Peaks, level: int, threshold: float) -> tuple[np.ndarray, ...]:
+    """Places of a coarse level in the image's pixels, and which of them stay above the noise without their brightest pixel."""
+    size = 1 << level
+    x, y = peaks.x * size + size // 2, peaks.y * size + size // 2
+    w = _around(array, x, y, size)
+    flat = np.sort(w.reshape(len(w), -1), axis=1)
+    # Without one pixel: it counts at most with the filter's middle weight.
+    without = peaks.excess - 4.0 * (flat[:, -1] - flat[:, -3])
+    return x, y, without > 0.7 * threshold * peaks.noise
+
+
+def _measure(
+    array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, snr: np.ndarray, floor: np.ndarray, level: int,
+    s: DetectionSettings, quantum: float,
+) -> Centroids:  # fmt: skip
+    """Fit the places of one level and keep those that are stars."""
+    half = HALF[level]
+    w = _around(array, x, y, half + _BORDER)
+    ring_mask = np.ones(w.shape[1:], bool)
+    ring_mask[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
+    ring = np.sort(w[:, ring_mask], axis=1)
+    count = ring.shape[1]
+    sky = ring[:, int(0.2 * count) : int(0.8 * count)].mean(axis=1)
+    rounding = quantum / np.sqrt(12.0)
+    noise = np.maximum((ring[:, int(0.8413 * count)] - ring[:, int(0.1587 * count)]) / 2, np.minimum(floor, rounding))
+    inner = w[:, _BORDER:-_BORDER, _BORDER:-_BORDER]
+    limit = image.saturation * 0.98
+    full = inner >= limit
+    d = np.arange(-half, half + 1)
+    outside = ((y[:, None] + d < 0) | (y[:, None] + d >= array.shape[0]))[:, :, None] | (
+        (x[:, None] + d < 0) | (x[:, None] + d >= array.shape[1])
+    )[:, None, :]
+    filled = full | outside
+    above = np.maximum(inner - sky[:, None, None], 0.0) * ~outside
+    core = above[:, half - 2 : half + 3, half - 2 : half + 3] + 1e-9
+    dx = np.arange(-2, 3)
+    total = core.sum(axis=(1, 2))
+    x0, y0 = (core.sum(axis=1) * dx).sum(axis=1) / total, (core.sum(axis=2) * dx).sum(axis=1) / total
+    good = (snr > 15) & ~filled.any(axis=(1, 2))
+    width, spread = _WIDTH[level], 0.35
+    some = np.flatnonzero(good)[:_FOR_WIDTH]
+    if some.size >= 3:
+        first = fit(inner[some], x0[some], y0[some], sky[some], noise[some], width, filled[some], spread)
+        width, spread = float(np.median(first.sigma)), 0.2
+    f = fit(inner, x0, y0, sky, noise, width, filled, spread)
+    gain = s.gain if s.gain is not None else gain_of(f.residual, f.model, noise, good)
+    covariance = f.covariance(np.maximum(noise, rounding), gain)
+    position = covariance[:, 2:4, 2:4] + s.optics_px**2 * np.eye(2)
+    saturated = full.any(axis=(1, 2))
+    position[saturated] += 0.1**2 * np.eye(2)
+    star = _is_star(f, noise, half, s)
+    peak = above.max(axis=(1, 2))
+    everything = Centroids(
+        x_px=x + f.x, y_px=y + f.y, flux=f.flux, covariance_px=position, peak=peak, saturated=saturated,
+        elongation=_elongation(above, f, half), snr=snr,
+    )  # fmt: skip
+    return everything.take(star)
+
+
+def _is_star(f: Fit, noise: np.ndarray, half: int, s: DetectionSettings) -> np.ndarray:
+    """Which fits look like a star: centred, neither a pixel nor a plane, and more light than the roughness around them."""
+    wide, narrow = f.sigma.max(axis=1), f.sigma.min(axis=1)
+    light = np.sum(f.model**2, axis=(1, 2))
+    explained = light / (light + np.sum(f.residual**2, axis=(1, 2)))
+    return (
+        (f.flux > 0.7 * s.threshold * noise * np.sqrt(4 * np.pi * wide * narrow + 1.0))
+        & (np.maximum(np.abs(f.x), np.abs(f.y)) < 0.6 * half)
+        & (wide < 0.6 * half)
+        & (explained > 0.4)
+    )
+
+
+def _elongation(above: np.ndarray, f: Fit, half: int) -> np.ndarray:
+    """Longer over shorter axis (n,) of the light's second moments under a window of twice its width."""
+    d = np.arange(-half, half + 1)
+    dx, dy = d - f.x[:, None], d - f.y[:, None]
+    reach = 2.0 * f.sigma.max(axis=1)[:, None] + 0.5
+    weight = above * np.exp(-0.5 * (dy / reach) ** 2)[:, :, None] * np.exp(-0.5 * (dx / reach) ** 2)[:, None, :]
+    total = weight.sum(axis=(1, 2)) + 1e-12
+    xx = (weight.sum(axis=1) * dx**2).sum(axis=1) / total
+    yy = (weight.sum(axis=2) * dy**2).sum(axis=1) / total
+    xy = np.einsum("nij,ni,nj->n", weight, dy, dx) / total
+    middle, swing = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    return np.sqrt((middle + swing) / np.maximum(middle - swing, 0.02 * middle + 1e-12))
+
+
+def _alone(stars: Centroids) -> np.ndarray:
+    """Indices of stars that are not a second finding, or an artefact, of a brighter one close by; brightest first."""
+    x, y, flux = stars.x_px, stars.y_px, stars.flux
+    d2 = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
+    brighter = np.arange(len(x)) < np.arange(len(x))[:, None]
+    same = (d2 < 4.0) | ((d2 < 14.0**2) & (flux[:, None] < 0.01 * flux))
+    return np.flatnonzero(~np.any(same & brighter, axis=1))
+
+
+__all__ = ["HALF", "DetectionSettings", "detect"]
