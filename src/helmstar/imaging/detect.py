@@ -7,6 +7,7 @@ A place is no star if its light is one pixel's (hot pixel) or one row's or colum
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from .pyramid import Peaks, find_peaks, halve
 HALF = (3, 5, 9)
 """Half the side of a star's window at each level, px."""
 _BORDER = 2
+_BRIGHT = 15.0
 _FOR_WIDTH = 40  # stars whose widths tell the optics
 _WIDTH = (0.8, 1.5, 3.0)  # sigma expected of a star found at each level, px
 
@@ -64,11 +66,17 @@ def detect(image: Image, settings: DetectionSettings | None = None, dark: np.nda
     x, y, level, snr, floor = _candidates(array, s, quantum)
     if not len(x):
         return _nothing()
+    width = _optics(array, image, x, y, level, snr)
+    if width:
+        # A faint star shows best at the scale of the optics: what only a coarser one sees is structure, unless it is bright.
+        best = int(np.argmin(np.abs(np.log(np.array(_WIDTH) / width))))
+        keep = (level <= best) | (snr > _BRIGHT)
+        x, y, level, snr, floor = (c[keep] for c in (x, y, level, snr, floor))
     parts = []
     for k in range(s.levels):
         mine = np.flatnonzero(level == k)
         if mine.size:
-            parts.append(_measure(array, image, x[mine], y[mine], snr[mine], floor[mine], k, s, quantum))
+            parts.append(_measure(array, image, x[mine], y[mine], snr[mine], floor[mine], k, width, s, quantum))
     whole = Centroids(**{f: np.concatenate([getattr(p, f) for p in parts]) for f in vars(parts[0])})
     whole = whole.take(np.argsort(-whole.flux, kind="stable"))
     return whole.take(_alone(whole)[: s.max_stars])
@@ -155,45 +163,108 @@ def _brightest_of(array: np.ndarray, peaks: Peaks, level: int, threshold: float)
     return x, y, without > 0.7 * threshold * peaks.noise
 
 
+@dataclass(frozen=True)
+class _Windows:
+    """Windows of n places at one level: inner (n, m, m) pixels, ring (n, k) pixels around, filled (n, m, m) what says nothing."""
+
+    inner: np.ndarray
+    ring: np.ndarray
+    full: np.ndarray
+    filled: np.ndarray
+    outside: np.ndarray
+    sky: np.ndarray
+    noise: np.ndarray
+    above: np.ndarray
+    x0: np.ndarray
+    y0: np.ndarray
+
+
+def _windows(
+    array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, half: int, floor: np.ndarray | float
+) -> _Windows:
+    w = _around(array, x, y, half + _BORDER)
+    ring = w[:, _ring(half)]
+    ordered = np.sort(ring, axis=1)
+    count = ring.shape[1]
+    sky = ordered[:, int(0.2 * count) : int(0.8 * count)].mean(axis=1)
+    noise = np.maximum((ordered[:, int(0.8413 * count)] - ordered[:, int(0.1587 * count)]) / 2, floor)
+    whole = np.arange(-half - _BORDER, half + _BORDER + 1)
+    off_y, off_x = y[:, None] + whole, x[:, None] + whole
+    off_y, off_x = (off_y < 0) | (off_y >= array.shape[0]), (off_x < 0) | (off_x >= array.shape[1])
+    off = off_y[:, :, None] | off_x[:, None, :]
+    ring = np.where(off[:, _ring(half)], sky[:, None], ring)  # what an edge repeats is no structure
+    outside = off[:, _BORDER:-_BORDER, _BORDER:-_BORDER]
+    inner = w[:, _BORDER:-_BORDER, _BORDER:-_BORDER]
+    full = inner >= 0.98 * image.saturation
+    above = np.maximum(inner - sky[:, None, None], 0.0) * ~outside
+    core = above[:, half - 2 : half + 3, half - 2 : half + 3] + 1e-9
+    d, total = np.arange(-2, 3), core.sum(axis=(1, 2))
+    x0, y0 = (core.sum(axis=1) * d).sum(axis=1) / total, (core.sum(axis=2) * d).sum(axis=1) / total
+    return _Windows(inner, ring, full, full | outside, outside, sky, noise, above, x0, y0)
+
+
+@cache
+def _ring(half: int) -> np.ndarray:
+    """Mask (m, m) of the border around a window."""
+    mask = np.ones((2 * (half + _BORDER) + 1,) * 2, bool)
+    mask[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
+    return mask
+
+
+@cache
+def _sectors(half: int) -> np.ndarray:
+    """(ring pixels, 8): weights that average the ring over eight directions."""
+    d = np.arange(-half - _BORDER, half + _BORDER + 1)
+    angle = np.arctan2(d[:, None], d[None, :])[_ring(half)]
+    number = np.rint(angle / (np.pi / 4)).astype(int) % 8
+    weight = (number[:, None] == np.arange(8)).astype(np.float32)
+    return weight / weight.sum(axis=0)
+
+
+def _optics(array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, level: np.ndarray, snr: np.ndarray) -> float:
+    """Sigma of the optics, px, from the brightest places that are not saturated; 0 where too few say."""
+    some = np.flatnonzero((snr > _BRIGHT) & (level < 2))[:_FOR_WIDTH]
+    if some.size < 3:
+        return 0.0
+    w = _windows(array, image, x[some], y[some], HALF[1], 1e-9)
+    clear = ~w.filled.any(axis=(1, 2)) & ~_in_structure(w, HALF[1])
+    if clear.sum() < 3:
+        return 0.0
+    f = fit(w.inner[clear], w.x0[clear], w.y0[clear], w.sky[clear], w.noise[clear], 1.0, w.filled[clear], 0.5)
+    return float(np.median(f.sigma))
+
+
+def _in_structure(w: _Windows, half: int) -> np.ndarray:
+    """Which places lie on a ridge (both sides of the ring bright along one line) or at the edge of something large."""
+    peak = np.max(w.above[:, half - 1 : half + 2, half - 1 : half + 2], axis=(1, 2))
+    rise = (w.ring - w.sky[:, None]) @ _sectors(half)
+    per_sector = w.ring.shape[1] / 8
+    allowed = (0.2 * peak + 2.5 * w.noise / np.sqrt(per_sector))[:, None]
+    ridge = (np.minimum(rise[:, :4], rise[:, 4:]) > allowed).any(axis=1)
+    return ridge | ((np.abs(rise) > allowed).sum(axis=1) >= 3)
+
+
 def _measure(
     array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, snr: np.ndarray, floor: np.ndarray, level: int,
-    s: DetectionSettings, quantum: float,
+    width: float, s: DetectionSettings, quantum: float,
 ) -> Centroids:  # fmt: skip
     """Fit the places of one level and keep those that are stars."""
     half = HALF[level]
-    w = _around(array, x, y, half + _BORDER)
-    ring_mask = np.ones(w.shape[1:], bool)
-    ring_mask[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
-    ring = np.sort(w[:, ring_mask], axis=1)
-    count = ring.shape[1]
-    sky = ring[:, int(0.2 * count) : int(0.8 * count)].mean(axis=1)
     rounding = quantum / np.sqrt(12.0)
-    noise = np.maximum((ring[:, int(0.8413 * count)] - ring[:, int(0.1587 * count)]) / 2, np.minimum(floor, rounding))
-    inner = w[:, _BORDER:-_BORDER, _BORDER:-_BORDER]
-    limit = image.saturation * 0.98
-    full = inner >= limit
-    d = np.arange(-half, half + 1)
-    outside = ((y[:, None] + d < 0) | (y[:, None] + d >= array.shape[0]))[:, :, None] | (
-        (x[:, None] + d < 0) | (x[:, None] + d >= array.shape[1])
-    )[:, None, :]
-    filled = full | outside
-    above = np.maximum(inner - sky[:, None, None], 0.0) * ~outside
-    core = above[:, half - 2 : half + 3, half - 2 : half + 3] + 1e-9
-    dx = np.arange(-2, 3)
-    total = core.sum(axis=(1, 2))
-    x0, y0 = (core.sum(axis=1) * dx).sum(axis=1) / total, (core.sum(axis=2) * dx).sum(axis=1) / total
-    good = (snr > 15) & ~filled.any(axis=(1, 2))
-    width, spread = _WIDTH[level], 0.35
-    some = np.flatnonzero(good)[:_FOR_WIDTH]
-    if some.size >= 3:
-        first = fit(inner[some], x0[some], y0[some], sky[some], noise[some], width, filled[some], spread)
-        width, spread = float(np.median(first.sigma)), 0.2
-    f = fit(inner, x0, y0, sky, noise, width, filled, spread)
-    gain = s.gain if s.gain is not None else gain_of(f.residual, f.model, noise, good)
-    covariance = f.covariance(np.maximum(noise, rounding), gain)
+    w = _windows(array, image, x, y, half, np.minimum(floor, rounding))
+    calm = ~_in_structure(w, half)
+    if not calm.any():
+        return _nothing()
+    x, y, snr = x[calm], y[calm], snr[calm]
+    w = _Windows(**{k: v[calm] for k, v in vars(w).items()})
+    f = fit(w.inner, w.x0, w.y0, w.sky, w.noise, width or _WIDTH[level], w.filled, 0.25 if width else 0.35)
+    clear = (snr > _BRIGHT) & ~w.filled.any(axis=(1, 2))
+    gain = s.gain if s.gain is not None else gain_of(f.residual, f.model, w.noise, clear)
+    covariance = f.covariance(np.maximum(w.noise, rounding), gain)
+    saturated = w.full.any(axis=(1, 2))
     position = covariance[:, 2:4, 2:4] + s.optics_px**2 * np.eye(2)
-    saturated = full.any(axis=(1, 2))
     position[saturated] += 0.1**2 * np.eye(2)
+    noise, above = w.noise, w.above
     star = _is_star(f, noise, half, s)
     peak = above.max(axis=(1, 2))
     everything = Centroids(
@@ -209,7 +280,7 @@ def _is_star(f: Fit, noise: np.ndarray, half: int, s: DetectionSettings) -> np.n
     light = np.sum(f.model**2, axis=(1, 2))
     explained = light / (light + np.sum(f.residual**2, axis=(1, 2)))
     return (
-        (f.flux > 0.7 * s.threshold * noise * np.sqrt(4 * np.pi * wide * narrow + 1.0))
+        (f.flux > 0.6 * s.threshold * noise * np.sqrt(4 * np.pi * wide * narrow))
         & (np.maximum(np.abs(f.x), np.abs(f.y)) < 0.6 * half)
         & (wide < 0.6 * half)
         & (explained > 0.4)
