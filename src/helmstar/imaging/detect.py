@@ -72,6 +72,7 @@ def detect(image: Image, settings: DetectionSettings | None = None, dark: np.nda
         best = int(np.argmin(np.abs(np.log(np.array(_WIDTH) / width))))
         keep = (level <= best) | (snr > _BRIGHT)
         x, y, level, snr, floor = (c[keep] for c in (x, y, level, snr, floor))
+        level = np.maximum(level, best)  # a window as wide as the optics need
     parts = []
     for k in range(s.levels):
         mine = np.flatnonzero(level == k)
@@ -261,7 +262,7 @@ def _measure(
     clear = (snr > _BRIGHT) & ~w.filled.any(axis=(1, 2))
     gain = s.gain if s.gain is not None else gain_of(f.residual, f.model, w.noise, clear)
     covariance = f.covariance(np.maximum(w.noise, rounding), gain)
-    saturated = w.full.any(axis=(1, 2))
+    saturated = np.asarray(w.full.any(axis=(1, 2)))
     position = covariance[:, 2:4, 2:4] + s.optics_px**2 * np.eye(2)
     position[saturated] += 0.1**2 * np.eye(2)
     noise, above = w.noise, w.above
