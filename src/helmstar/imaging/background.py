@@ -32,10 +32,10 @@ class Mesh:
     def at(self, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Sky and noise (n,) at rows and columns (n,)."""
         (i, a), (j, b) = (_place(p, size, n) for p, size, n in zip((y, x), self.shape, self.sky.shape))
+        below, beside = np.minimum(i + 1, self.sky.shape[0] - 1), np.minimum(j + 1, self.sky.shape[1] - 1)
         both = []
-        for mesh in (self.sky, self.noise):
-            m = np.pad(mesh, ((0, 1), (0, 1)), mode="edge")
-            left, right = m[i, j] + a * (m[i + 1, j] - m[i, j]), m[i, j + 1] + a * (m[i + 1, j + 1] - m[i, j + 1])
+        for m in (self.sky, self.noise):
+            left, right = m[i, j] + a * (m[below, j] - m[i, j]), m[i, beside] + a * (m[below, beside] - m[i, beside])
             both.append(left + b * (right - left))
         return both[0], both[1]
 
@@ -83,7 +83,7 @@ def mesh_of(sample: np.ndarray, shape: tuple[int, int], tile: int, floor: float)
     tail = rest.ravel()
     rare = np.partition(tail, int(0.999 * tail.size))[int(0.999 * tail.size)] / 3.09
     noise = np.maximum(_over_neighbours(np.maximum(*spread)), np.clip(rare, 0.35 * floor, floor))
-    return Mesh(sky=sky + _over_neighbours(middle), noise=noise.astype(np.float32), shape=shape)
+    return Mesh(sky=sky, noise=noise.astype(np.float32), shape=shape)
 
 
 def _by_tile(values: np.ndarray, tiles: list[int]) -> np.ndarray:
@@ -94,9 +94,11 @@ def _by_tile(values: np.ndarray, tiles: list[int]) -> np.ndarray:
 
 def _over_neighbours(mesh: np.ndarray) -> np.ndarray:
     """Median of 3 x 3 tiles, edges repeated."""
-    p = np.pad(mesh, 1, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(p, (3, 3))
-    return np.sort(windows.reshape(*mesh.shape, 9), axis=-1)[..., 4]
+    h, w = mesh.shape
+    p = mesh[np.clip(np.arange(-1, h + 1), 0, h - 1)][:, np.clip(np.arange(-1, w + 1), 0, w - 1)]
+    nine = np.stack([p[i : i + h, j : j + w] for i in range(3) for j in range(3)])
+    nine.sort(axis=0)
+    return nine[4]
 
 
 __all__ = ["PER_TILE", "Mesh", "between", "mesh_of"]

@@ -20,7 +20,7 @@ from scipy.special import erf
 ITERATIONS = 8
 MIN_SIGMA = 0.3
 _LOOSE = 0.35  # relative spread of widths that the first guess allows
-_ROOT2 = np.sqrt(2.0)
+_STILL = 4e-3  # px; smaller steps change nothing that noise leaves
 
 
 @dataclass(frozen=True)
@@ -46,22 +46,29 @@ class Fit:
         return noise[:, None, None] ** 2 * self.bread + gain * (self.bread @ self.light @ self.bread)
 
 
-def _profile(centre: np.ndarray, sigma: np.ndarray, half: int) -> np.ndarray:
-    """(n, 3, m): share of a Gaussian in each pixel along one axis, its derivatives by centre and by width."""
-    edges = np.arange(-half, half + 2) - 0.5
-    t = (edges - centre[:, None]) / sigma[:, None]
-    whole = 0.5 * erf(t / _ROOT2)
-    slope = np.exp(-0.5 * t * t) * (1.0 / np.sqrt(2.0 * np.pi) / sigma[:, None])
-    return np.stack([np.diff(whole), -np.diff(slope), -np.diff(t * slope)], axis=1)
+def _factors(
+    x: np.ndarray, y: np.ndarray, flux: np.ndarray, sigma: np.ndarray, half: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """U (n, 6, m) along y and V (n, 6, m) along x: column k of the Jacobian is the outer product of row k of both.
 
-
-def _factors(x: np.ndarray, y: np.ndarray, flux: np.ndarray, sigma: np.ndarray, half: int) -> tuple[np.ndarray, ...]:
-    """U (n, 6, m) along y and V (n, 6, m) along x: column k of the Jacobian is the outer product of row k of both."""
-    px, py = _profile(x, sigma[:, 0], half), _profile(y, sigma[:, 1], half)
+    Along each axis: the share of a Gaussian in each pixel, its derivatives by centre and by width.
+    """
+    n, m = len(x), 2 * half + 1
+    inverse = 1.0 / sigma.T[:, :, None]
+    t = (np.arange(-half, half + 2) - 0.5 - np.stack([x, y])[:, :, None]) * inverse
+    whole = erf(t * np.sqrt(0.5))
+    slope = np.exp(-0.5 * t * t) * (inverse / np.sqrt(2.0 * np.pi))
+    share = 0.5 * (whole[..., 1:] - whole[..., :-1])
+    by_centre = slope[..., :-1] - slope[..., 1:]
+    slope *= t
+    by_width = slope[..., :-1] - slope[..., 1:]
+    U, V = np.empty((n, 6, m)), np.empty((n, 6, m))
     f = flux[:, None]
-    one = np.ones_like(px[:, 0])
-    U = np.stack([py[:, 0], one, f * py[:, 0], f * py[:, 1], f * py[:, 0], f * py[:, 2]], axis=1)
-    V = np.stack([px[:, 0], one, px[:, 1], px[:, 0], px[:, 2], px[:, 0]], axis=1)
+    U[:, 0], U[:, 1] = share[1], 1.0
+    U[:, 2] = U[:, 4] = f * share[1]
+    U[:, 3], U[:, 5] = f * by_centre[1], f * by_width[1]
+    V[:, 0] = V[:, 3] = V[:, 5] = share[0]
+    V[:, 1], V[:, 2], V[:, 4] = 1.0, by_centre[0], by_width[0]
     return U, V
 
 
@@ -77,46 +84,46 @@ def fit(
     n, m, _ = windows.shape
     half = m // 2
     data = windows.astype(float)
-    masked = filled.any(axis=(1, 2))
-    sigma = np.full((n, 2), float(width))
-    sky0, sky = sky, sky.astype(float)
-    x, y = x.astype(float), y.astype(float)
-    flux = np.maximum(np.where(filled, 0.0, data - sky[:, None, None]).sum(axis=(1, 2)), noise)
-    variance = np.maximum(noise, 1e-9) ** 2
+    # x, y, flux and so on by column, as the parameters of `Fit`
+    p = np.empty((n, 6))
+    p[:, 0] = np.maximum(np.where(filled, 0.0, data - sky[:, None, None]).sum(axis=(1, 2)), noise)
+    p[:, 1], p[:, 2], p[:, 3], p[:, 4:] = sky, x, y, width
+    expected = np.concatenate([np.zeros((n, 1)), sky[:, None], np.zeros((n, 2)), np.full((n, 2), width)], axis=1)
     prior = np.zeros((n, 6))
     prior[:, 1] = 2.0 * m
-    prior[:, 4:] = (variance / (tight * width) ** 2)[:, None]
-    A = np.empty((n, 6, 6))
-    U, V = _factors(x, y, flux, sigma, half)
-    rest = data
-    eye = np.arange(6)
+    prior[:, 4:] = (np.maximum(noise, 1e-9) ** 2 / (tight * width) ** 2)[:, None]
+    low, high = np.array([-np.inf, -half, -half, MIN_SIGMA, MIN_SIGMA]), np.array([np.inf, half, half, half, half])
+    going = np.arange(n)
     for k in range(ITERATIONS):
-        model = flux[:, None, None] * U[:, 0, :, None] * V[:, 0, None, :]
-        rest = data - model - sky[:, None, None]
-        if masked.any():
-            rest[filled] = 0.0
-        A = (U @ U.transpose(0, 2, 1)) * (V @ V.transpose(0, 2, 1))
-        g = np.sum((U @ rest) * V, axis=2)
-        A[:, eye, eye] += prior
-        g[:, 1] += prior[:, 1] * (sky0 - sky)
-        g[:, 4:] += prior[:, 4:] * (width - sigma)
-        A[:, eye, eye] *= 1.0 + 1e-9
+        q = p[going]
+        U, V = _factors(q[:, 2], q[:, 3], q[:, 0], q[:, 4:], half)
+        rest = data[going] - (q[:, 0, None] * U[:, 0])[:, :, None] * V[:, 0, None, :] - q[:, 1, None, None]
+        rest[filled[going]] = 0.0
+        A = _normal(U, V, prior[going])
+        g = np.sum((U @ rest) * V, axis=2) + prior[going] * (expected[going] - q)
         step = np.linalg.solve(A, g[..., None])[..., 0]
-        # What a saturated star lacks is filled from the model, so its flux has far to go: a larger step, still a safe one.
-        limit = 0.5 * np.minimum(1.0, np.abs(flux) + 1e-9)
-        step[:, 2:] = np.clip(step[:, 2:], -0.5, 0.5)
-        x, y = np.clip(x + step[:, 2], -half, half), np.clip(y + step[:, 3], -half, half)
-        flux = np.maximum(flux + step[:, 0], 1e-3 * np.maximum(limit, 1e-9))
-        sky = sky + step[:, 1]
-        sigma = np.clip(sigma + step[:, 4:], MIN_SIGMA, half)
-        U, V = _factors(x, y, flux, sigma, half)
-        if k > 1 and not np.abs(step[:, 2:4]).max() > 2e-3:
-            break
-    model = flux[:, None, None] * U[:, 0, :, None] * V[:, 0, None, :]
-    rest = data - model - sky[:, None, None]
+        np.clip(step[:, 2:], -0.5, 0.5, out=step[:, 2:])
+        p[going, 0] = np.maximum(q[:, 0] + step[:, 0], 0.1 * q[:, 0])
+        p[going, 1:] = np.clip(q[:, 1:] + step[:, 1:], low, high)
+        if k:
+            going = going[np.abs(step[:, 2:4]).max(axis=1) > _STILL]
+            if not going.size:
+                break
+    U, V = _factors(p[:, 2], p[:, 3], p[:, 0], p[:, 4:], half)
+    model = (p[:, 0, None] * U[:, 0])[:, :, None] * V[:, 0, None, :]
+    rest = data - model - p[:, 1, None, None]
     rest[filled] = 0.0
-    light = ((U * U[:, :1]) @ U.transpose(0, 2, 1)) * ((V * V[:, :1]) @ V.transpose(0, 2, 1)) * flux[:, None, None]
-    return Fit(x, y, flux, sky, sigma, np.linalg.inv(A), light, rest, model)
+    light = ((U * U[:, :1]) @ U.transpose(0, 2, 1)) * ((V * V[:, :1]) @ V.transpose(0, 2, 1)) * p[:, 0, None, None]
+    bread = np.linalg.inv(_normal(U, V, prior))
+    return Fit(p[:, 2], p[:, 3], p[:, 0], p[:, 1], p[:, 4:], bread, light, rest, model)
+
+
+def _normal(U: np.ndarray, V: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """J^T J with the prior and a trace of damping, (n, 6, 6)."""
+    A = (U @ U.transpose(0, 2, 1)) * (V @ V.transpose(0, 2, 1))
+    k = np.arange(6)
+    A[:, k, k] = (A[:, k, k] + prior) * (1.0 + 1e-9)
+    return A
 
 
 def gain_of(residual: np.ndarray, model: np.ndarray, noise: np.ndarray, use: np.ndarray) -> float:

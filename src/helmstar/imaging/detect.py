@@ -19,7 +19,8 @@ HALF = (3, 5, 9)
 """Half the side of a star's window at each level, px."""
 _BORDER = 2
 _BRIGHT = 15.0
-_FOR_WIDTH = 40  # stars whose widths tell the optics
+_COARSE = 1.8  # px; optics broader than this need the coarsest level
+_FOR_WIDTH = 24  # stars whose widths tell the optics
 _WIDTH = (0.8, 1.5, 3.0)  # sigma expected of a star found at each level, px
 
 
@@ -63,10 +64,27 @@ def detect(image: Image, settings: DetectionSettings | None = None, dark: np.nda
         array = array.astype(np.float32)
     quantum = 1.0 if image.array.dtype.kind == "u" else 0.0
     quantum = max(quantum, 1e-12)
-    x, y, level, snr, floor = _candidates(array, s, quantum)
+    found: list[tuple[np.ndarray, ...]] = []
+    width, binned = 0.0, array
+    places: tuple[np.ndarray, ...] = ()
+    for k in range(s.levels):
+        if min(binned.shape) < 40:
+            break
+        found.append(_candidates(array, binned, k, s, quantum))
+        if k == 0 and s.levels > 1:
+            binned = halve(binned)
+            continue
+        places = _merged(found, s)
+        width = _optics(array, image, *places[:4])
+        if width and width < _COARSE:  # sharp stars: the coarsest level would show only structure
+            break
+        if k + 1 < s.levels:
+            binned = halve(binned)
+    if not found:
+        return _nothing()
+    x, y, level, snr, floor = places or _merged(found, s)
     if not len(x):
         return _nothing()
-    width = _optics(array, image, x, y, level, snr)
     if width:
         # A faint star shows best at the scale of the optics: what only a coarser one sees is structure, unless it is bright.
         best = int(np.argmin(np.abs(np.log(np.array(_WIDTH) / width))))
@@ -88,32 +106,29 @@ def _nothing() -> Centroids:
     return Centroids(n, n, n, np.zeros((0, 2, 2)), n, n.astype(bool), n, n)
 
 
-def _candidates(array: np.ndarray, s: DetectionSettings, quantum: float) -> tuple[np.ndarray, ...]:
-    """Places x, y (n,) int in the image, levels, signal over noise and noise of a pixel: the strongest of each neighbourhood."""
-    found: list[tuple[np.ndarray, ...]] = []
-    binned = array
-    for level in range(s.levels):
-        if min(binned.shape) < 40:
-            break
-        peaks = find_peaks(binned, level, s.threshold, quantum)
-        if level == 0:
-            x, y, keep = peaks.x, peaks.y, _wider_than_a_pixel(array, peaks, quantum)
-        else:
-            x, y, keep = _brightest_of(array, peaks, level, s.threshold)
-        snr = peaks.excess[keep] / peaks.noise[keep]
-        floor = peaks.noise[keep] / (6 << level)
-        order = _strongest(snr, 2 * s.max_stars)
-        found.append((x[keep][order], y[keep][order], np.full(order.size, level), snr[order], floor[order]))
-        if level + 1 < s.levels:
-            binned = halve(binned)
-    if not found:
-        return (np.zeros(0, int),) * 5
+def _candidates(
+    array: np.ndarray, binned: np.ndarray, level: int, s: DetectionSettings, quantum: float
+) -> tuple[np.ndarray, ...]:
+    """Places x, y (n,) int in the image, level, signal over noise and noise of a pixel, of one level of the pyramid."""
+    peaks = find_peaks(binned, level, s.threshold, quantum)
+    if level == 0:
+        x, y, keep = peaks.x, peaks.y, _wider_than_a_pixel(array, peaks, quantum)
+    else:
+        x, y, keep = _brightest_of(array, peaks, level, s.threshold)
+    snr = peaks.excess[keep] / peaks.noise[keep]
+    order = _strongest(snr, 2 * s.max_stars)
+    floor = peaks.noise[keep] / (6 << level)
+    return x[keep][order], y[keep][order], np.full(order.size, level), snr[order], floor[order]
+
+
+def _merged(found: list[tuple[np.ndarray, ...]], s: DetectionSettings) -> tuple[np.ndarray, ...]:
+    """The places of all levels, the strongest of each neighbourhood, the strongest first."""
     merged = [np.concatenate(c) for c in zip(*found)]
-    order = _strongest(merged[3], 4 * s.max_stars)
+    order = _strongest(merged[3], 3 * s.max_stars)
     x, y, level = (c[order] for c in merged[:3])
     reach = np.array(HALF)[level]
     near = np.maximum(np.abs(x[:, None] - x), np.abs(y[:, None] - y)) <= reach  # of the stronger one, in the columns
-    first = order[~np.any(np.tril(near, -1), axis=1)][: 3 * s.max_stars // 2]
+    first = order[~np.any(np.tril(near, -1), axis=1)][: 5 * s.max_stars // 4]
     return tuple(c[first] for c in merged)
 
 
