@@ -1,4 +1,7 @@
-"""Floor 1: cameras, star images and what is seen in them. NumPy and SciPy; no JAX."""
+"""Floor 1: cameras, star images and what is seen in them. NumPy and SciPy; no JAX.
+
+`calibrate` and `render` are modules to import: they load more of SciPy than solving needs.
+"""
 
 from .camera import Camera, read_camera, write_camera
 from .detect import DetectionSettings, detect

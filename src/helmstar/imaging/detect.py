@@ -19,6 +19,7 @@ HALF = (3, 5, 9)
 """Half the side of a star's window at each level, px."""
 _BORDER = 2
 _BRIGHT = 15.0
+_MISFIT = 1.5  # chi-square per pixel above which the model, not noise, is what is wrong
 _COARSE = 1.8  # px; optics broader than this need the coarsest level
 _FOR_WIDTH = 24  # stars whose widths tell the optics
 _WIDTH = (0.8, 1.5, 3.0)  # sigma expected of a star found at each level, px
@@ -35,7 +36,7 @@ class DetectionSettings:
     threshold: float = 5.0
     max_stars: int = 100
     levels: int = 3
-    optics_px: float = 0.02
+    optics_px: float = 0.05
     gain: float | None = None
 
     def __post_init__(self) -> None:
@@ -271,14 +272,18 @@ def _measure(
     calm = ~_in_structure(w, half)
     if not calm.any():
         return _nothing()
-    x, y, snr = x[calm], y[calm], snr[calm]
+    x, y, snr, floor = x[calm], y[calm], snr[calm], floor[calm]
     w = _Windows(**{k: v[calm] for k, v in vars(w).items()})
     f = fit(w.inner, w.x0, w.y0, w.sky, w.noise, width or _WIDTH[level], w.filled, 0.25 if width else 0.35)
     clear = (snr > _BRIGHT) & ~w.filled.any(axis=(1, 2))
     gain = s.gain if s.gain is not None else gain_of(f.residual, f.model, w.noise, clear)
-    covariance = f.covariance(np.maximum(w.noise, rounding), gain)
+    # Noise with a pattern (mosaics, JPEG) is larger in sums of pixels than its pixels say; the filtered image shows it.
+    real = np.maximum(w.noise, floor)
+    position = f.covariance(real, gain)[:, 2:4, 2:4]
+    misfit = np.mean(f.residual**2 / (real[:, None, None] ** 2 + gain * f.model), axis=(1, 2))
+    position *= np.where(misfit > _MISFIT, misfit, 1.0)[:, None, None]
+    position += s.optics_px**2 * np.eye(2)
     saturated = np.asarray(w.full.any(axis=(1, 2)))
-    position = covariance[:, 2:4, 2:4] + s.optics_px**2 * np.eye(2)
     position[saturated] += 0.1**2 * np.eye(2)
     noise, above = w.noise, w.above
     star = _is_star(f, noise, half, s)
