@@ -1,0 +1,382 @@
+"""Lost in space: from a list of centroids to an attitude with its matches, covariance and the probability that it is false."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import numpy as np
+
+from ..attitude import quaternion_of_matrix, quest
+from .catalog import load_catalog
+from .hypotheses import detection_pairs, hypotheses, levels_for
+from .patterns import BRIGHT, BRIGHTEST, FAINT, LADDER, Sky
+from .pinhole import Camera, ideal_pixels
+from .verify import Detections, Fit, Freedom, jacobian, probability_false, turn, verify
+
+Status = Literal["solved", "too few stars", "no match", "uncertain"]
+
+MOST_DETECTIONS = 120
+"""The brightest of a longer list are used."""
+FEWEST = 3
+"""Stars that a solution must match; with a known zero point of magnitudes 2 may do."""
+LIMIT = 1e-6
+"""Default of the largest probability that a solution is false."""
+AT_ONCE, KEPT, POOL = 2, 10, 150
+"""Hypotheses of each chunk that are verified at once, that are kept, and that are verified when a table is exhausted."""
+WORK = 3_000_000
+"""Catalogue pairs that are looked at before the search gives up."""
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What an image shows. Where status is not 'solved', the attitude and all that depends on it are NaN or empty.
+
+    status: 'solved'; 'too few stars'; 'no match': nothing fits better than chance; 'uncertain': the best attitude is more probably
+    false than the caller allows.
+    q_SN, q_BN: (4,) scalar last, N to sensor frame S and to body B (B is S without a mounting). covariance: (3, 3) rad^2 of the
+    error on the left, in S. ra, dec, roll: rad, of the z axis of S; roll is north's angle from image up (-y of S),
+    counter-clockwise. detections, stars, hip: (k,) indices of the matches in the caller's list and the catalogue, Hipparcos
+    numbers. residuals_px: (k, 2) measured minus predicted. residual_rms: rad, per axis. focal_px: fitted or given.
+    zero_point: V minus the given magnitude. probability_false, log_odds: see verify.py. work: catalogue pairs looked at.
+    """
+
+    status: Status
+    q_SN: np.ndarray
+    q_BN: np.ndarray
+    covariance: np.ndarray
+    ra: float
+    dec: float
+    roll: float
+    detections: np.ndarray
+    stars: np.ndarray
+    hip: np.ndarray
+    residuals_px: np.ndarray
+    residual_rms: float
+    focal_px: float
+    zero_point: float
+    probability_false: float
+    log_odds: float
+    work: int
+
+    @property
+    def solved(self) -> bool:
+        return self.status == "solved"
+
+
+@cache
+def default_sky(year: float = 2000.0) -> Sky:
+    """Hipparcos to V = 9 at a Julian year, without aberration."""
+    return Sky(load_catalog(), year)
+
+
+def identify(
+    xy_px: np.ndarray,
+    camera: Camera,
+    *,
+    flux: np.ndarray | None = None,
+    magnitude: np.ndarray | None = None,
+    sigma_px: float | np.ndarray = 0.5,
+    fov_range: tuple[float, float] | None = None,
+    focal_sigma: float = 0.001,
+    magnitude_sigma: float = 0.4,
+    zero_point: float | None = None,
+    q_SB: np.ndarray | None = None,
+    sky: Sky | None = None,
+    limit: float = LIMIT,
+    work: int = WORK,
+) -> Identification:
+    """Identify the stars of an image without a prior attitude.
+
+    xy_px: (n, 2) image pixels. flux (n,) > 0 or magnitude (n,): brightness in any band and unit, the order matters most; without
+    them the list is taken as it comes. sigma_px: 1 sigma per axis, a number, (n,), or covariances (n, 2, 2).
+    camera: its focal length and distortion do not count when fov_range, horizontal full fields (rad), is given; focal_sigma:
+    relative 1 sigma of its focal length otherwise. magnitude_sigma: 1 sigma of V minus (magnitude + zero point); zero_point: where
+    it is known. q_SB: (4,) mounting. limit: largest probability_false of what is called solved. work: catalogue pairs to look at
+    before giving up.
+
+    Entries that are not finite are left out. Raises ValueError for shapes, ranges and parameters that mean nothing.
+    """
+    d, covariances = prepare(xy_px, camera, flux, magnitude, sigma_px, magnitude_sigma, zero_point)
+    freedom = focal_freedom(camera, fov_range, focal_sigma)
+    if not 0.0 < limit < 1.0:
+        raise ValueError(f"limit {limit}: must be between 0 and 1")
+    sky = default_sky() if sky is None else sky
+    fewest = 2 if d.zero_point is not None and d.magnitude is not None and not freedom.free else FEWEST
+    if len(d) < fewest:
+        return unsolved("too few stars", 0)
+    fits, done = search(sky, d, freedom, fewest, limit, work)
+    return conclude(sky, d, covariances, freedom, fits, done, fewest, limit, q_SB)
+
+
+def prepare(
+    xy_px: np.ndarray,
+    camera: Camera,
+    flux: np.ndarray | None,
+    magnitude: np.ndarray | None,
+    sigma_px: float | np.ndarray,
+    magnitude_sigma: float,
+    zero_point: float | None,
+) -> tuple[Detections, np.ndarray]:
+    """Detections in ideal pixels, brightest first, and their covariances (n, 2, 2). Raises ValueError for what means nothing."""
+    xy = np.asarray(xy_px, dtype=float)
+    if xy.size == 0:
+        xy = xy.reshape(0, 2)
+    if xy.ndim != 2 or xy.shape[1] != 2:
+        raise ValueError(f"xy_px {xy.shape}: must be (n, 2)")
+    n = len(xy)
+    if flux is not None and magnitude is not None:
+        raise ValueError("flux and magnitude: must be one or the other")
+    if not magnitude_sigma > 0.0:
+        raise ValueError(f"magnitude_sigma {magnitude_sigma}: must be positive")
+    m = None
+    if flux is not None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            m = -2.5 * np.log10(np.asarray(flux, dtype=float))
+    elif magnitude is not None:
+        m = np.asarray(magnitude, dtype=float)
+    if m is not None and m.shape != (n,):
+        raise ValueError(f"brightness {m.shape}: must have one entry for each of the {n} positions")
+    sigma = np.asarray(sigma_px, dtype=float)
+    if sigma.shape not in ((), (n,), (n, 2, 2)):
+        raise ValueError(f"sigma_px {sigma.shape}: must be a number, ({n},) or ({n}, 2, 2)")
+    stretch = np.array([1.0, camera.aspect])
+    if sigma.ndim == 3:
+        C = sigma * stretch[:, None] * stretch
+    else:
+        C = np.broadcast_to(sigma**2, (n,))[:, None, None] * np.diag(stretch**2)
+    good = np.isfinite(xy).all(axis=1) & (C[:, 0, 0] > 0) & (C[:, 0, 0] * C[:, 1, 1] > C[:, 0, 1] ** 2)
+    good &= np.isfinite(C).all(axis=(1, 2))
+    if m is not None:
+        good &= np.isfinite(m)
+    order = np.flatnonzero(good)
+    if m is not None:
+        order = order[np.argsort(m[order], kind="stable")]
+    corners = np.array([[0.0, 0.0], [camera.size_px[0], camera.size_px[1]]])
+    low, high = (corners - np.asarray(camera.centre_px)) * stretch
+    p = ideal_pixels(camera, xy[order])
+    # One star counts once: of detections closer than a pixel the brightest stays.
+    keep = np.ones(len(order), dtype=bool)
+    for k in np.flatnonzero(_crowded(p)):
+        before = keep[:k] & (np.abs(p[:k] - p[k]).max(axis=1) < 1.0)
+        keep[k] = not before.any()
+    order, p = order[keep][:MOST_DETECTIONS], p[keep][:MOST_DETECTIONS]
+    C = C[order]
+    brightness = None if m is None else m[order]
+    per_axis = np.sqrt(0.5 * (C[:, 0, 0] + C[:, 1, 1]))
+    density = _log_density(brightness) if brightness is not None and len(order) else np.zeros(len(order))
+    d = Detections(p, per_axis, brightness, magnitude_sigma, zero_point, density, low, high, order)
+    return d, C
+
+
+def _crowded(p: np.ndarray) -> np.ndarray:
+    """(n,) whether anything else lies within a pixel; cheap for the usual list, where nothing does."""
+    if len(p) < 2:
+        return np.zeros(len(p), dtype=bool)
+    order = np.argsort(p[:, 0], kind="stable")
+    close = np.flatnonzero(np.diff(p[order, 0]) < 1.0)
+    out = np.zeros(len(p), dtype=bool)
+    out[order[close]] = out[order[close + 1]] = True
+    return out
+
+
+def _log_density(m: np.ndarray) -> np.ndarray:
+    """Log density (n,) 1/mag of the detections' own magnitudes: half a smoothed count, half even over their range."""
+    width = 0.5
+    z = (m[:, None] - m[None, :]) / width
+    smooth = np.exp(-0.5 * z * z).mean(axis=1) / (width * np.sqrt(2.0 * np.pi))
+    even = 1.0 / (np.ptp(m) + 2.0 * width)
+    return np.log(0.5 * smooth + 0.5 * even)
+
+
+def focal_freedom(camera: Camera, fov_range: tuple[float, float] | None, focal_sigma: float) -> Freedom:
+    """The focal length's prior. Raises ValueError for a range or sigma that means nothing."""
+    if fov_range is None:
+        if not (np.isfinite(camera.focal_px) and camera.focal_px > 0.0):
+            raise ValueError(f"focal_px {camera.focal_px}: must be positive; give fov_range where it is unknown")
+        if not 0.0 <= focal_sigma < 0.05:
+            raise ValueError(f"focal_sigma {focal_sigma}: must be 0 to 0.05; give fov_range for less certain fields")
+        f = float(camera.focal_px)
+        return Freedom(f * (1.0 - 5.0 * focal_sigma), f * (1.0 + 5.0 * focal_sigma), f, focal_sigma)
+    low, high = fov_range
+    if not 0.0 < low < high < np.pi:
+        raise ValueError(f"fov_range {fov_range} rad: must be increasing between 0 and pi")
+    half = 0.5 * camera.size_px[0]
+    return Freedom(half / float(np.tan(0.5 * high)), half / float(np.tan(0.5 * low)))
+
+
+def search(sky: Sky, d: Detections, freedom: Freedom, fewest: int, limit: float, work: int) -> tuple[list[Fit], int]:
+    """Distinct fits found, and the catalogue pairs looked at; stops at the first that is convincing.
+
+    Of each chunk of hypotheses the best few are verified at once. The next best wait in a pool, which is verified, best first,
+    when a table is exhausted: most searches end long before.
+    """
+    enough = min(limit, LIMIT)
+    fits: list[Fit] = []
+    done = 0
+    pairs = detection_pairs(d)
+    levels = levels_for(d, freedom, LADDER)
+    block = 3 if freedom.free else max(len(pairs), 1)
+    for n in (BRIGHTEST, BRIGHT, FAINT) if freedom.free else (BRIGHT, FAINT):
+        pool: list[tuple[float, int, np.ndarray, float]] = []
+        for begin in range(0, len(pairs), block):
+            for k, part in levels:
+                for looked, found in hypotheses(sky.level(k), n, d, pairs[begin : begin + block], part, KEPT):
+                    done += looked
+                    if found is None:
+                        continue
+                    ranked = [
+                        (float(s), k, R, float(f)) for R, f, s in zip(found.R, found.f, found.score) if s > fewest - 0.5
+                    ]
+                    if try_all(sky, d, ranked[:AT_ONCE], freedom, fits, fewest, enough):
+                        return fits, done
+                    pool += ranked[AT_ONCE:]
+                    if done > work:
+                        break
+                if done > work:
+                    break
+            if done > work:
+                break
+        pool.sort(key=lambda entry: -entry[0])
+        if try_all(sky, d, pool[:POOL], freedom, fits, fewest, enough) or done > work:
+            break
+    return fits, done
+
+
+def try_all(sky: Sky, d: Detections, ranked, freedom: Freedom, fits: list[Fit], fewest: int, limit: float) -> bool:
+    """Verify hypotheses (score, level, R, f) and add the fits to the list; True once one is convincing."""
+    for _, k, R, f in ranked:
+        if any(same(R, f, fit) for fit in fits):
+            continue
+        fit = verify(sky, k, d, R, f, freedom)
+        if fit is None or len(fit.stars) < fewest:
+            continue
+        add(fits, fit)
+        if fit.log_odds > -np.log(limit) and probability_false(fits) < limit:
+            return True
+    return False
+
+
+def same(R: np.ndarray, f: float, fit: Fit) -> bool:
+    """Whether a hypothesis is within 1 deg and 2% of a fit."""
+    return abs(f / fit.f - 1.0) < 0.02 and float((R * fit.R).sum()) > 3.0 - 3e-4
+
+
+def add(fits: list[Fit], fit: Fit) -> None:
+    """Keep the better of two fits of one attitude."""
+    for k, other in enumerate(fits):
+        if same(fit.R, fit.f, other):
+            if fit.log_odds > other.log_odds:
+                fits[k] = fit
+            return
+    fits.append(fit)
+
+
+def conclude(
+    sky: Sky,
+    d: Detections,
+    covariances: np.ndarray,
+    freedom: Freedom,
+    fits: list[Fit],
+    done: int,
+    fewest: int,
+    limit: float,
+    q_SB: np.ndarray | None,
+) -> Identification:
+    """The best fit as a solution, polished with the detections' covariances; or why there is none."""
+    if not fits:
+        return unsolved("no match", done)
+    best = max(fits, key=lambda fit: fit.log_odds)
+    p_false = probability_false(fits)
+    if not p_false < limit or len(best.stars) < fewest:
+        return unsolved("no match" if best.log_odds < 0.0 else "uncertain", done, p_false, best.log_odds)
+    R, f, P, residuals = polish(sky, d, covariances[best.detections], best, freedom)
+    q_SN = quaternion_of_matrix(R)
+    if q_SB is None:
+        q_BN = q_SN
+    else:
+        from scipy.spatial.transform import Rotation
+
+        q_BN = (Rotation.from_quat(q_SB).inv() * Rotation.from_quat(q_SN)).as_quat()
+    z = R[2]
+    ra, dec = float(np.arctan2(z[1], z[0]) % (2.0 * np.pi)), float(np.arcsin(np.clip(z[2], -1.0, 1.0)))
+    # The north pole seen in S: its angle from -y, positive towards -x.
+    roll = float(np.arctan2(-R[0, 2], -R[1, 2]) % (2.0 * np.pi))
+    rms = float(np.sqrt((residuals**2).mean()) / f)
+    return Identification(
+        "solved", q_SN, q_BN, P, ra, dec, roll, d.order[best.detections], best.stars, sky.catalog.hip[best.stars],
+        residuals, rms, f, best.zero_point, p_false, best.log_odds, done,
+    )  # fmt: skip
+
+
+def polish(sky: Sky, d: Detections, C: np.ndarray, fit: Fit, freedom: Freedom):
+    """R, f, covariance (3, 3) and residuals (k, 2): QUEST, then Gauss and Newton with the whole covariances and f.
+
+    The covariance is that of the detections, times chi-square per degree of freedom where the residuals say more.
+    """
+    xy, f = d.xy[fit.detections], fit.f
+    r = sky.directions[fit.stars]
+    R = fit.R
+    b = np.concatenate([xy, np.full((len(xy), 1), f)], axis=1)
+    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    if len(xy) > 2:
+        wahba = quest(b, r, d.sigma[fit.detections] / f)
+        if wahba.observable:
+            R = matrix_of_quaternion(wahba.q_BN)
+    W = np.linalg.inv(C)
+    information = np.zeros((4, 4))
+    for _ in range(3):
+        v = r @ R.T
+        u = v[:, :2] / v[:, 2:]
+        J = jacobian(u, f)
+        residual = xy - f * u
+        information = np.einsum("kia,kij,kjb->ab", J, W, J)
+        g = np.einsum("kia,kij,kj->a", J, W, residual)
+        if not freedom.free:
+            weight = 1.0 / max(freedom.sigma, 1e-6) ** 2
+            information[3, 3] += weight
+            g[3] += weight * np.log(freedom.f_known / f)
+        delta = np.linalg.solve(information, g)
+        R, f = turn(delta[:3], R), f * float(np.exp(delta[3]))
+    v = r @ R.T
+    residual = xy - f * v[:, :2] / v[:, 2:]
+    chi2 = float(np.einsum("ki,kij,kj->", residual, W, residual))
+    freedoms = 2 * len(xy) - (4 if freedom.free else 3)
+    inflation = max(1.0, chi2 / freedoms) if freedoms > 4 else 1.0
+    return R, f, np.linalg.inv(information)[:3, :3] * inflation, residual
+
+
+def matrix_of_quaternion(q: np.ndarray) -> np.ndarray:
+    """R (3, 3) of q (4,) scalar last."""
+    u, w = q[:3], q[3]
+    K = np.array([[0.0, -u[2], u[1]], [u[2], 0.0, -u[0]], [-u[1], u[0], 0.0]])
+    return np.eye(3) + 2.0 * (w * K + K @ K)
+
+
+def unsolved(status: Status, done: int, p_false: float = 1.0, odds: float = -np.inf) -> Identification:
+    """An identification without an attitude."""
+    nan, none = float("nan"), np.zeros(0, dtype=int)
+    q = np.full(4, nan)
+    return Identification(
+        status,
+        q,
+        q,
+        np.full((3, 3), nan),
+        nan,
+        nan,
+        nan,
+        none,
+        none,
+        none,
+        np.zeros((0, 2)),
+        nan,
+        nan,
+        nan,
+        p_false,
+        odds,
+        done,
+    )
+
+
+__all__ = ["Identification", "default_sky", "identify"]

@@ -1,0 +1,280 @@
+"""How probable it is that an attitude explains a list of detections: Bayes' rule with false, missing and misjudged stars.
+
+The hypothesis "attitude R, focal length f" is weighed against "every detection is false". With k of the S catalogue stars
+expected in the image matched, residuals r_j (px), detections of density lam (1/px^2) and magnitudes m_j,
+
+    odds = prod_j [ N(r_j; s^2 C_j) p(m_j | star) / (lam p(m_j)) ]  B(1 + k, 1 + S - k) / B(1, 1)
+           x sqrt(det 2 pi P) / V.
+
+- The middle factor is the chance of k detections among S stars with the detection probability integrated out (uniform prior), so
+  a field that misses its bright stars pays for it and one that misses 60% evenly still passes. S is unknown too: how deep the
+  image is. The odds are averaged over all S.
+- The last factor is the price of having fitted the attitude (and focal length): the volume that the fit leaves over the volume V
+  that it was chosen from, 8 pi^2 for SO(3). It takes the place of a count of tested hypotheses, and with it the odds are
+  posterior odds whatever the search did. The zero point of the magnitudes and the scale s pay likewise.
+- p(m | star) is a Gaussian around the catalogue's V and zero point, with a broad share for other bands and variable stars.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .patterns import Sky
+
+BROAD_SHARE, BROAD_SIGMA = 0.15, 1.5
+"""Share and 1 sigma (mag) of matches whose magnitude is not what the catalogue says."""
+ZERO_POINT_RANGE = 10.0
+"""Where an unknown zero point may lie (mag, full width): sets the price of fitting it."""
+LOG_FACTORIAL = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1.0, 400.0)))])
+SO3_VOLUME = 8.0 * np.pi**2
+HOPELESS = -14.0
+"""Log odds after the first step below which a hypothesis is dropped."""
+GATE = 3.6
+"""Residuals of matches, over sigma."""
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What identification knows of an image; every array has its brightest entry first where brightness is known.
+
+    xy: (n, 2) ideal pixels from the principal point. sigma: (n,) px, per axis. magnitude: (n,) or None, of unknown zero point
+    unless `zero_point` (V minus magnitude) is given. log_magnitude_density: (n,) log of the detections' own magnitude density.
+    low, high: (2,) corners of the image in ideal pixels. order: (n,) index in the caller's list.
+    """
+
+    xy: np.ndarray
+    sigma: np.ndarray
+    magnitude: np.ndarray | None
+    magnitude_sigma: float
+    zero_point: float | None
+    log_magnitude_density: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    order: np.ndarray
+
+    @property
+    def area(self) -> float:
+        return float(np.prod(self.high - self.low))
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """An attitude with its matches: R (3, 3) = R_SN, f in px, stars and detections (k,) by index, log_odds against "all
+    false", sigma_scale the factor on the detections' sigma, information (4, 4) of (theta in S, ln f) with that factor."""
+
+    R: np.ndarray
+    f: float
+    stars: np.ndarray
+    detections: np.ndarray
+    residuals: np.ndarray
+    log_odds: float
+    sigma_scale: float
+    zero_point: float
+    information: np.ndarray
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """The focal length's prior: uniform in ln f between the logs of f_low and f_high, or Gaussian of relative sigma around
+    f_known; sigma 0 keeps it fixed."""
+
+    f_low: float
+    f_high: float
+    f_known: float = 0.0
+    sigma: float = 0.0
+
+    @property
+    def free(self) -> bool:
+        return self.f_known <= 0.0
+
+
+def jacobian(u: np.ndarray, f: float) -> np.ndarray:
+    """Derivative (k, 2, 4) of ideal pixels by (theta, ln f) at u (k, 2) = (X/Z, Y/Z), R = exp([theta x]) R_hat."""
+    x, y = u[:, 0], u[:, 1]
+    one = np.ones_like(x)
+    J = np.empty((len(u), 2, 4))
+    J[:, 0, 0], J[:, 0, 1], J[:, 0, 2], J[:, 0, 3] = -x * y, one + x * x, -y, x
+    J[:, 1, 0], J[:, 1, 1], J[:, 1, 2], J[:, 1, 3] = -(one + y * y), x * y, x, y
+    return f * J
+
+
+def turn(theta: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """exp([theta x]) R."""
+    t = float(np.sqrt(theta @ theta))
+    K = np.array([[0.0, -theta[2], theta[1]], [theta[2], 0.0, -theta[0]], [-theta[1], theta[0], 0.0]])
+    a = np.sin(t) / t if t > 1e-12 else 1.0
+    b = (1.0 - np.cos(t)) / t**2 if t > 1e-6 else 0.5
+    return R + (a * K + b * (K @ K)) @ R
+
+
+def expected_stars(sky: Sky, level: int, R: np.ndarray, f: float, d: Detections, limit: int) -> np.ndarray:
+    """Catalogue indices, brightest first, of what may be in the image or just beyond its edge: about `limit` at most."""
+    middle = 0.5 * (d.low + d.high)
+    axis = R.T @ np.array([middle[0], middle[1], f])
+    half = 0.5 * (d.high - d.low)
+    stars = sky.near(level, axis / np.sqrt(axis @ axis), 1.03 * float(np.arctan(np.sqrt(half @ half) / f)))
+    p, front = project(sky.directions.take(stars, axis=0), R, f)
+    margin = 0.1 * half
+    return stars[front & inside(p, d.low - margin, d.high + margin)][: limit + limit // 2]
+
+
+def project(r: np.ndarray, R: np.ndarray, f: float) -> tuple[np.ndarray, np.ndarray]:
+    """Ideal pixels (S, 2) of directions r (S, 3) in N, and which of them are in front (S,)."""
+    v = r @ R.T
+    z = v[:, 2]
+    return v[:, :2] * (f / np.maximum(z, 1e-3))[:, None], z > 1e-3
+
+
+def inside(p: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Which pixels (S, 2) lie between two corners."""
+    x, y = p[:, 0], p[:, 1]
+    return (x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1])
+
+
+def nearest_pairs(p: np.ndarray, d: Detections, gate_px: np.ndarray, excess: np.ndarray | None):
+    """Stars and detections (k,), (k,) that are each other's nearest within the gate (n,), ordered by star.
+
+    excess: (S, n) added to the squared distance over sigma, for magnitudes that disagree.
+    """
+    delta = p[:, None, :] - d.xy[None, :, :]
+    square = delta[..., 0] ** 2 + delta[..., 1] ** 2
+    cost = square / d.sigma**2
+    if excess is not None:
+        cost = cost + excess
+    cost[square > gate_px**2] = np.inf
+    if cost.size == 0:
+        return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
+    j = cost.argmin(axis=1)
+    rows = np.arange(len(p))
+    good = np.isfinite(cost[rows, j]) & (cost.argmin(axis=0)[j] == rows)
+    return rows[good], j[good]
+
+
+def step(u, residual, sigma, f, freedom: Freedom) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Newton step (4,) for (theta, ln f) and the information (4, 4) of weighted residuals (k, 2)."""
+    J = jacobian(u, f) / sigma[:, None, None]
+    A = J.reshape(-1, 4)
+    information = A.T @ A
+    g = A.T @ (residual / sigma[:, None]).ravel()
+    if not freedom.free:
+        weight = 1.0 / max(freedom.sigma, 1e-6) ** 2
+        information[3, 3] += weight
+        g[3] += weight * np.log(freedom.f_known / f)
+    # A whisper of a prior keeps two coincident stars from a singular matrix; no real geometry notices.
+    damped = information + np.diag(np.full(4, 1e-12 * information.trace() + 1e-9))
+    return np.linalg.solve(damped, g), information
+
+
+def magnitude_terms(
+    d: Detections, magnitude: np.ndarray, i: np.ndarray, j: np.ndarray
+) -> tuple[np.ndarray, float, float]:
+    """Log likelihood ratio (k,) of the matches' magnitudes, the zero point, and the log of what fitting it costs."""
+    if d.magnitude is None or len(i) == 0:
+        return np.zeros(len(i)), 0.0, 0.0
+    dm = magnitude[i] - d.magnitude[j]
+    s = d.magnitude_sigma
+    if d.zero_point is None:
+        zero = float(np.median(dm))
+        price = float(np.log(min(1.0, np.sqrt(2.0 * np.pi) * 1.25 * s / np.sqrt(len(dm)) / ZERO_POINT_RANGE)))
+    else:
+        zero, price = d.zero_point, 0.0
+    z = dm - zero
+    density = (1.0 - BROAD_SHARE) / s * np.exp(-0.5 * (z / s) ** 2)
+    density += BROAD_SHARE / BROAD_SIGMA * np.exp(-0.5 * (z / BROAD_SIGMA) ** 2)
+    return np.log(density / np.sqrt(2.0 * np.pi) + 1e-6) - d.log_magnitude_density[j], zero, price
+
+
+def log_odds(d: Detections, gain: np.ndarray, rank: np.ndarray, expected: int) -> float:
+    """Of the matches, without the price of the fit: gain (k,) in the order of rank (k,) among the expected stars."""
+    depth = np.arange(1, expected + 1)
+    k = np.searchsorted(rank, depth, side="left")
+    # B(1 + k, 1 + S - k) = k! (S - k)! / (S + 1)!
+    beta = LOG_FACTORIAL[k] + LOG_FACTORIAL[depth - k] - LOG_FACTORIAL[depth + 1]
+    total = np.concatenate([[0.0], np.cumsum(gain)])[k] + beta
+    top = total.max()
+    return float(top + np.log(np.exp(total - top).sum()) - np.log(expected))
+
+
+def verify(
+    sky: Sky,
+    level: int,
+    d: Detections,
+    R: np.ndarray,
+    f: float,
+    freedom: Freedom,
+    *,
+    first_gate: float = 3.0,
+    rounds: int = 3,
+    volume: float = SO3_VOLUME,
+) -> Fit | None:
+    """Match, fit and weigh, starting at R (3, 3) and f; None where fewer than two stars fit or nothing speaks for it.
+
+    first_gate: of the first round, over GATE sigma, for what the start does not know yet. volume: rad^3, of attitudes that were
+    possible before.
+    """
+    limit = int(min(220, max(60, 3 * len(d))))
+    candidates = expected_stars(sky, level, R, f, d, limit)
+    r, V = sky.directions[candidates], sky.magnitude[candidates]
+    # The density of false detections cannot be read from a list that is all true: at least one per image, on top.
+    density = (len(d) + 1.0) / d.area
+    scale, zero = 1.0, d.zero_point
+    for turn_number in range(rounds + 1):
+        p, _ = project(r, R, f)
+        seen = np.flatnonzero(inside(p, d.low, d.high))[:limit]
+        p = p[seen]
+        widen = (first_gate, 0.5 * (1.0 + first_gate), 1.0)[min(turn_number, 2)]
+        excess = None
+        if d.magnitude is not None and zero is not None and turn_number > 0:
+            z = (V[seen][:, None] - d.magnitude[None, :] - zero) / d.magnitude_sigma
+            excess = np.minimum(z * z, 12.0)
+        i, j = nearest_pairs(p, d, widen * GATE * scale * d.sigma, excess)
+        if len(i) < 2:
+            return None
+        residual = d.xy[j] - p[i]
+        sigma = scale * d.sigma[j]
+        gain, zero, price = magnitude_terms(d, V[seen], i, j)
+        if turn_number > 0:
+            gain = gain - 0.5 * (residual**2).sum(axis=1) / sigma**2 - np.log(2.0 * np.pi * sigma**2 * density)
+            _, information = step(p[i] / f, residual, sigma, f, freedom)
+            total = log_odds(d, gain, i, len(seen)) + price - (np.log(2.0) if scale > 1.0 else 0.0)
+            total += _log_fit_volume(information, freedom, volume)
+            if turn_number == rounds:
+                return Fit(R, f, candidates[seen[i]], j, residual, total, scale, zero, information)
+            if turn_number == 1 and total < HOPELESS:
+                return None
+        delta, _ = step(p[i] / f, residual, sigma, f, freedom)
+        R = turn(delta[:3], R)
+        f = float(np.clip(f * np.exp(np.clip(delta[3], -0.1, 0.1)), 0.97 * freedom.f_low, 1.03 * freedom.f_high))
+        if turn_number > 0 and len(i) >= 5:
+            rest = residual - jacobian(p[i] / f, f) @ delta
+            chi = np.sqrt((rest**2).sum(axis=1)) / d.sigma[j]
+            scale = float(np.clip(np.median(chi) / 1.18, 1.0, 3.0))
+    return None
+
+
+def _log_fit_volume(information: np.ndarray, freedom: Freedom, volume: float) -> float:
+    """Log of the volume that the fit leaves over the one it was chosen from."""
+    if freedom.free:
+        volume *= max(float(np.log(freedom.f_high / freedom.f_low)), 1e-3)
+    else:  # the Gaussian prior of ln f stands in the information; this is its norm
+        volume *= np.sqrt(2.0 * np.pi) * max(freedom.sigma, 1e-6)
+    sign, logdet = np.linalg.slogdet(information)
+    if sign <= 0:
+        return -np.inf
+    return float(min(0.0, 0.5 * (4.0 * np.log(2.0 * np.pi) - logdet) - np.log(volume)))
+
+
+def probability_false(fits: list[Fit]) -> float:
+    """Posterior probability that the best of the fits is not the true one: all false, or another fit."""
+    odds = np.array([fit.log_odds for fit in fits])
+    top = odds.max()
+    others = np.exp(-top) + np.exp(np.sort(odds)[:-1] - top).sum()
+    return float(others / (1.0 + others))
+
+
+__all__ = ["Detections", "Fit", "Freedom", "probability_false", "verify"]
