@@ -141,7 +141,9 @@ class Camera:
     def _reach(self) -> float:
         """The radius sqrt(x^2 + y^2) up to which the radial distortion grows; infinite for most lenses."""
         k1, k2, _, _, k3 = self.distortion
-        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1 - _FOLD])
+        slope = np.array([7 * k3, 5 * k2, 3 * k1, 1 - _FOLD])
+        slope[np.abs(slope) < 1e-9] = 0.0  # such a fold lies beyond 88 deg, and tiny leading terms spoil the roots
+        roots = np.roots(slope)
         real = roots.real[(np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots))) & (roots.real > 0)]
         return float(np.sqrt(real.min())) if real.size else math.inf
 

@@ -20,6 +20,7 @@ from scipy.special import erf
 ITERATIONS = 8
 MIN_SIGMA = 0.3
 _LOOSE = 0.35  # relative spread of widths that the first guess allows
+_PARAMETERS = 5.5  # of six, what the prior on sky and widths leaves free
 _STILL = 4e-3  # px; smaller steps change nothing that noise leaves
 
 
@@ -126,20 +127,20 @@ def _normal(U: np.ndarray, V: np.ndarray, prior: np.ndarray) -> np.ndarray:
     return A
 
 
-def gain_of(residual: np.ndarray, model: np.ndarray, noise: np.ndarray, use: np.ndarray) -> float:
+def gain_of(f: Fit, noise: np.ndarray, use: np.ndarray) -> float:
     """Variance for each unit of light that the residuals of the stars `use` (n,) show beyond the noise (n,); at least 0.
 
-    One ratio for each star from the pixels in which it is bright, then the median: one double star or one hot pixel does not
-    decide. The fit's own parameters take their share of the degrees of freedom.
+    A fit takes part of the variance with it: with the projection H = J bread J^T on its parameters the squared residuals sum to
+    noise^2 (pixels - parameters) + gain (sum of light - trace(bread light)). For sharp optics that last bracket is a small part
+    of the light. The median over stars: one double star or one hot pixel does not decide.
     """
     if not use.any():
         return 0.0
-    r, light = residual[use], np.maximum(model[use], 0.0)
-    bright = light > 0.05 * light.max(axis=(1, 2), keepdims=True)
-    count = bright.sum(axis=(1, 2))
-    excess = np.sum(np.where(bright, r**2, 0.0), axis=(1, 2)) - count * noise[use] ** 2
-    share = np.sum(np.where(bright, light, 0.0), axis=(1, 2)) * np.clip((count - 5.0) / count, 0.2, 1.0)
-    return float(max(np.median(excess / share), 0.0))
+    r = f.residual[use]
+    total = f.model[use].sum(axis=(1, 2))
+    left = np.maximum(total - np.einsum("nij,nji->n", f.bread[use], f.light[use]), 0.02 * total)
+    excess = np.sum(r**2, axis=(1, 2)) - noise[use] ** 2 * (r[0].size - _PARAMETERS)
+    return float(max(np.median(excess / left), 0.0))
 
 
 __all__ = ["ITERATIONS", "MIN_SIGMA", "Fit", "fit", "gain_of"]

@@ -174,7 +174,7 @@ def _brightest_of(array: np.ndarray, peaks: Peaks, level: int, threshold: float)
     size = 1 << level
     x, y = peaks.x * size + size // 2, peaks.y * size + size // 2
     w = _around(array, x, y, size)
-    flat = np.sort(w.reshape(len(w), -1), axis=1)
+    flat = np.sort(w.reshape(len(w), w.shape[1] ** 2), axis=1)
     # Without one pixel: it counts at most with the filter's middle weight.
     without = peaks.excess - 4.0 * (flat[:, -1] - flat[:, -3])
     return x, y, without > 0.7 * threshold * peaks.noise
@@ -229,13 +229,13 @@ def _ring(half: int) -> np.ndarray:
 
 
 @cache
-def _sectors(half: int) -> np.ndarray:
-    """(ring pixels, 8): weights that average the ring over eight directions."""
+def _sectors(half: int) -> tuple[np.ndarray, np.ndarray]:
+    """Ring pixels in the order of the eight directions they lie in, and where each direction starts."""
     d = np.arange(-half - _BORDER, half + _BORDER + 1)
     angle = np.arctan2(d[:, None], d[None, :])[_ring(half)]
     number = np.rint(angle / (np.pi / 4)).astype(int) % 8
-    weight = (number[:, None] == np.arange(8)).astype(np.float32)
-    return weight / weight.sum(axis=0)
+    order = np.argsort(number, kind="stable")
+    return order, np.searchsorted(number[order], np.arange(8))
 
 
 def _optics(array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, level: np.ndarray, snr: np.ndarray) -> float:
@@ -254,11 +254,12 @@ def _optics(array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, level
 def _in_structure(w: _Windows, half: int) -> np.ndarray:
     """Which places lie on a ridge (both sides of the ring bright along one line) or at the edge of something large."""
     peak = np.max(w.above[:, half - 1 : half + 2, half - 1 : half + 2], axis=(1, 2))
-    rise = (w.ring - w.sky[:, None]) @ _sectors(half)
-    per_sector = w.ring.shape[1] / 8
-    allowed = (0.2 * peak + 2.5 * w.noise / np.sqrt(per_sector))[:, None]
-    ridge = (np.minimum(rise[:, :4], rise[:, 4:]) > allowed).any(axis=1)
-    return ridge | ((np.abs(rise) > allowed).sum(axis=1) >= 3)
+    order, starts = _sectors(half)
+    ring = (w.ring - w.sky[:, None])[:, order]
+    most = np.maximum.reduceat(ring, starts, axis=1)
+    mean = np.add.reduceat(ring, starts, axis=1) / np.diff(np.append(starts, ring.shape[1]))
+    ridge = (np.minimum(most[:, :4], most[:, 4:]) > (0.3 * peak + 3.5 * w.noise)[:, None]).any(axis=1)
+    return ridge | ((np.abs(mean) > (0.2 * peak + w.noise)[:, None]).sum(axis=1) >= 3)
 
 
 def _measure(
@@ -276,7 +277,7 @@ def _measure(
     w = _Windows(**{k: v[calm] for k, v in vars(w).items()})
     f = fit(w.inner, w.x0, w.y0, w.sky, w.noise, width or _WIDTH[level], w.filled, 0.25 if width else 0.35)
     clear = (snr > _BRIGHT) & ~w.filled.any(axis=(1, 2))
-    gain = s.gain if s.gain is not None else gain_of(f.residual, f.model, w.noise, clear)
+    gain = s.gain if s.gain is not None else gain_of(f, w.noise, clear)
     # Noise with a pattern (mosaics, JPEG) is larger in sums of pixels than its pixels say; the filtered image shows it.
     real = np.maximum(w.noise, floor)
     position = f.covariance(real, gain)[:, 2:4, 2:4]
