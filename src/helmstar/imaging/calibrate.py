@@ -19,7 +19,7 @@ from .camera import Camera
 
 PARAMETERS = ("focal", "cx", "cy", "aspect", "k1", "k2", "p1", "p2", "k3")
 DEFAULT = ("focal", "cx", "cy", "k1", "k2", "p1", "p2")
-_ROUNDS = 4
+_ROUNDS = 12
 _OUTLIER = 5.0
 _OPEN = 0.3
 """A parameter whose sigma is more than this share of its prior's was not seen by the stars."""
@@ -181,7 +181,9 @@ class _Problem:
 
         start = np.concatenate([p, np.zeros(3 * self.count)])
         scale = np.concatenate([self.prior, np.full(3 * self.count, 0.01)])
-        options: dict[str, Any] = {"jac": jac, "loss": "soft_l1", "f_scale": 2.0, "x_scale": scale, "max_nfev": 100}
+        # From a wrong camera every star is an outlier: the loss is as wide as the residuals are, round by round.
+        wide = max(2.0, 2.0 * float(np.nanmedian(np.abs(at(start)[0]))))
+        options: dict[str, Any] = {"jac": jac, "loss": "soft_l1", "f_scale": wide, "x_scale": scale, "max_nfev": 100}
         found = least_squares(fun, start, xtol=1e-14, ftol=1e-14, gtol=1e-12, **options)
         turns = Rotation.from_rotvec(found.x[size:].reshape(-1, 3)).as_matrix()
         return found.x[:size], turns @ R, float(np.max(np.abs((found.x - start) / scale)))
