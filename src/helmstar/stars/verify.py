@@ -31,6 +31,8 @@ LOG_FACTORIAL = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1.0, 400.0)))]
 SO3_VOLUME = 8.0 * np.pi**2
 HOPELESS = -14.0
 """Log odds after the first step below which a hypothesis is dropped."""
+SCALES = (1.8, 3.2)
+"""Factors on the detections' sigmas that are tried where the residuals ask for it."""
 GATE = 3.6
 """Residuals of matches, over sigma."""
 
@@ -219,42 +221,80 @@ def verify(
     """
     limit = int(min(220, max(60, 3 * len(d))))
     candidates = expected_stars(sky, level, R, f, d, limit)
-    r, V = sky.directions[candidates], sky.magnitude[candidates]
-    # The density of false detections cannot be read from a list that is all true: at least one per image, on top.
-    density = (len(d) + 1.0) / d.area
-    scale, zero = 1.0, d.zero_point
-    for turn_number in range(rounds + 1):
-        p, _ = project(r, R, f)
-        seen = np.flatnonzero(inside(p, d.low, d.high))[:limit]
-        p = p[seen]
-        widen = (first_gate, 0.5 * (1.0 + first_gate), 1.0)[min(turn_number, 2)]
-        excess = None
-        if d.magnitude is not None and zero is not None and turn_number > 0:
-            z = (V[seen][:, None] - d.magnitude[None, :] - zero) / d.magnitude_sigma
-            excess = np.minimum(z * z, 12.0)
-        i, j = nearest_pairs(p, d, widen * GATE * scale * d.sigma, excess)
-        if len(i) < 2:
-            return None
-        residual = d.xy[j] - p[i]
-        sigma = scale * d.sigma[j]
-        gain, zero, price = magnitude_terms(d, V[seen], i, j)
-        if turn_number > 0:
-            gain = gain - 0.5 * (residual**2).sum(axis=1) / sigma**2 - np.log(2.0 * np.pi * sigma**2 * density)
-            _, information = step(p[i] / f, residual, sigma, f, freedom)
-            total = log_odds(d, gain, i, len(seen)) + price - (np.log(2.0) if scale > 1.0 else 0.0)
-            total += _log_fit_volume(information, freedom, volume)
-            if turn_number == rounds:
-                return Fit(R, f, candidates[seen[i]], j, residual, total, scale, zero, information)
-            if turn_number == 1 and total < HOPELESS:
+    field = _Field(d, freedom, candidates, sky.directions[candidates], sky.magnitude[candidates], limit, volume)
+    best = field.settle(R, f, 1.0, first_gate, rounds)
+    # Sigmas that were told too small show in the residuals. Wider ones are tried, and kept only if they explain more: estimated
+    # from the residuals they would grow with every false match that the wider gate lets in.
+    for scale in SCALES:
+        if best is None or best.log_odds < 0.0 or _typical(best, d) < 1.25 * best.sigma_scale:
+            break
+        wider = field.settle(best.R, best.f, scale, 1.0, 2)
+        if wider is None or wider.log_odds <= best.log_odds:
+            break
+        best = wider
+    return best
+
+
+def _typical(fit: Fit, d: Detections) -> float:
+    """Median residual of a fit over what the detections' sigmas promise."""
+    return float(np.median(np.sqrt((fit.residuals**2).sum(axis=1)) / d.sigma[fit.detections])) / 1.18
+
+
+@dataclass(frozen=True)
+class _Field:
+    """What a hypothesis is weighed against: detections, and the stars that may be seen (r (S, 3) in N, V (S,))."""
+
+    d: Detections
+    freedom: Freedom
+    candidates: np.ndarray
+    r: np.ndarray
+    V: np.ndarray
+    limit: int
+    volume: float
+
+    def settle(self, R: np.ndarray, f: float, scale: float, first_gate: float, rounds: int) -> Fit | None:
+        """Match and step `rounds` times, then match and weigh."""
+        d, freedom, zero = self.d, self.freedom, self.d.zero_point
+        # The density of false detections cannot be read from a list that is all true: at least one per image, on top.
+        density = (len(d) + 1.0) / d.area
+        for turn_number in range(rounds + 1):
+            p, _ = project(self.r, R, f)
+            seen = np.flatnonzero(inside(p, d.low, d.high))[: self.limit]
+            p = p[seen]
+            widen = (first_gate, 0.5 * (1.0 + first_gate), 1.0)[min(turn_number, 2)]
+            excess = None
+            if d.magnitude is not None and zero is not None and turn_number > 0:
+                z = (self.V[seen][:, None] - d.magnitude[None, :] - zero) / d.magnitude_sigma
+                excess = np.minimum(z * z, 12.0)
+            i, j = nearest_pairs(p, d, widen * GATE * scale * d.sigma, excess)
+            if len(i) < 2:
                 return None
-        delta, _ = step(p[i] / f, residual, sigma, f, freedom)
-        R = turn(delta[:3], R)
-        f = float(np.clip(f * np.exp(np.clip(delta[3], -0.1, 0.1)), 0.97 * freedom.f_low, 1.03 * freedom.f_high))
-        if turn_number > 0 and len(i) >= 5:
-            rest = residual - jacobian(p[i] / f, f) @ delta
-            chi = np.sqrt((rest**2).sum(axis=1)) / d.sigma[j]
-            scale = float(np.clip(np.median(chi) / 1.18, 1.0, 3.0))
-    return None
+            residual = d.xy[j] - p[i]
+            sigma = scale * d.sigma[j]
+            square = (residual**2).sum(axis=1) / sigma**2
+            if turn_number in (1, rounds):
+                gain, zero, price = magnitude_terms(d, self.V[seen], i, j)
+                gain = gain - 0.5 * square - np.log(2.0 * np.pi * sigma**2 * density)
+                # A match that speaks against the hypothesis is none: the star is missing and the detection false.
+                good = np.flatnonzero(gain > 0.0)
+                if len(good) < 2:
+                    return None
+                _, information = step(p[i[good]] / f, residual[good], sigma[good], f, freedom)
+                total = log_odds(d, gain[good], i[good], len(seen)) + price - np.log(scale)
+                total += _log_fit_volume(information, freedom, self.volume)
+                if turn_number == rounds:
+                    stars = self.candidates[seen[i[good]]]
+                    return Fit(R, f, stars, j[good], residual[good], total, scale, zero, information)
+                if total < HOPELESS:
+                    return None
+            elif turn_number == 0:
+                _, zero, _ = magnitude_terms(d, self.V[seen], i, j)
+            # Far residuals of a wide gate are mostly false matches: they pull less.
+            soft = sigma * np.sqrt(1.0 + square / (2.0 * widen) ** 2)
+            delta, _ = step(p[i] / f, residual, soft, f, freedom)
+            R = turn(delta[:3], R)
+            f = float(np.clip(f * np.exp(np.clip(delta[3], -0.1, 0.1)), 0.97 * freedom.f_low, 1.03 * freedom.f_high))
+        return None
 
 
 def _log_fit_volume(information: np.ndarray, freedom: Freedom, volume: float) -> float:
