@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-PER_TILE = 16
+PER_TILE = 12
 """Samples along the side of a tile."""
 _QUANTILES = ((0.8413, 1.0), (0.9332, 1.5))  # of a normal distribution, and how many sigma they lie above the median
 

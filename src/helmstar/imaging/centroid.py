@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erf
 
-ITERATIONS = 8
+ITERATIONS = 6
 MIN_SIGMA = 0.3
 _LOOSE = 0.35  # relative spread of widths that the first guess allows
 _PARAMETERS = 5.5  # of six, what the prior on sky and widths leaves free

@@ -91,7 +91,9 @@ def detect(image: Image, settings: DetectionSettings | None = None, dark: np.nda
         best = int(np.argmin(np.abs(np.log(np.array(_WIDTH) / width))))
         keep = (level <= best) | (snr > _BRIGHT)
         x, y, level, snr, floor = (c[keep] for c in (x, y, level, snr, floor))
-        level = np.maximum(level, best)  # a window as wide as the optics need
+        # A window as wide as the optics need; a wider one only for what is full, whose light reaches farther.
+        full = array[y, x] >= 0.98 * image.saturation
+        level = np.where(full, np.maximum(level, best), best)
     parts = []
     for k in range(s.levels):
         mine = np.flatnonzero(level == k)

@@ -14,7 +14,7 @@ import numpy as np
 from .background import PER_TILE, mesh_of
 
 TILE = 64
-_BAND = 64
+_BAND = 128
 _ROWS = 8  # share one threshold
 WEIGHT = 16.0
 """Sum of the filter's weights."""
