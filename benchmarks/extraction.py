@@ -60,14 +60,14 @@ def main() -> None:
         if sep is not None:
             array = image.array.astype(np.float32)
 
-            def extract(a: np.ndarray = array) -> object:
+            def extract(a: np.ndarray = array) -> np.ndarray:
                 sky = sep.Background(a)
                 return sep.extract(a - sky.back(), 5.0, err=sky.globalrms)
 
             print(
                 f"{name:28s} {'sep, no fit':22s} {len(extract()):5d} "
                 + "{:9.2f} {:9.2f} {:7.2f}".format(*timed(extract, repeats))
-            )  # type: ignore[arg-type]
+            )
 
 
 if __name__ == "__main__":

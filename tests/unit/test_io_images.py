@@ -233,7 +233,7 @@ def test_any_bytes_are_data_errors(tmp_path_factory, tail, magic):
         read_image(path)
 
 
-def test_reading_loads_no_jax():
-    code = "import helmstar.io.images, helmstar.imaging, sys; print([m for m in ('jax', 'pydantic', 'pandas') if m in sys.modules])"
+def test_reading_and_detecting_load_nothing_heavy():
+    code = "import helmstar.io.images, helmstar.imaging, sys; print([m for m in ('jax', 'pydantic', 'pandas', 'scipy') if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"

@@ -15,11 +15,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import erf
 
 ITERATIONS = 6
 MIN_SIGMA = 0.3
 _LOOSE = 0.35  # relative spread of widths that the first guess allows
+_ERF = (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429)
 _PARAMETERS = 5.5  # of six, what the prior on sky and widths leaves free
 _STILL = 4e-3  # px; smaller steps change nothing that noise leaves
 
@@ -57,8 +57,12 @@ def _factors(
     n, m = len(x), 2 * half + 1
     inverse = 1.0 / sigma.T[:, :, None]
     t = (np.arange(-half, half + 2) - 0.5 - np.stack([x, y])[:, :, None]) * inverse
-    whole = erf(t * np.sqrt(0.5))
-    slope = np.exp(-0.5 * t * t) * (inverse / np.sqrt(2.0 * np.pi))
+    bell = np.exp(-0.5 * t * t)
+    # Abramowitz and Stegun 7.1.26 (error below 1.5e-7): the exponential is at hand, and scipy.special takes 0.3 s to import.
+    k = 1.0 / (1.0 + 0.3275911 * np.sqrt(0.5) * np.abs(t))
+    tail = k * (_ERF[0] + k * (_ERF[1] + k * (_ERF[2] + k * (_ERF[3] + k * _ERF[4])))) * bell
+    whole = np.copysign(1.0 - tail, t)
+    slope = bell * (inverse / np.sqrt(2.0 * np.pi))
     share = 0.5 * (whole[..., 1:] - whole[..., :-1])
     by_centre = slope[..., :-1] - slope[..., 1:]
     slope *= t
