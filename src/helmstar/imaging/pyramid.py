@@ -13,7 +13,8 @@ import numpy as np
 
 from .background import PER_TILE, mesh_of
 
-TILE = 64
+TILES = (64, 48, 32)
+"""Side of a tile of the sky's mesh at each level, in its own pixels."""
 _BAND = 128
 _ROWS = 8  # share one threshold
 WEIGHT = 16.0
@@ -76,7 +77,7 @@ def find_peaks(array: np.ndarray, level: int, threshold: float, quantum: float) 
     """
     h, w = array.shape
     out = np.dtype(np.uint16 if array.dtype in (np.uint8, np.uint16) else np.float32)
-    tile = max(TILE >> level, 2 * PER_TILE)
+    tile = TILES[level]
     stride = max(1, tile // PER_TILE)
     floor = quantum / np.sqrt(12.0) * 2**level * _NOISE
     mesh = mesh_of(_sampled(array, stride, out), (h - 2, w - 2), tile, floor)
@@ -118,4 +119,4 @@ def find_peaks(array: np.ndarray, level: int, threshold: float, quantum: float) 
     return Peaks(x + 1, y + 1, value - sky, noise)
 
 
-__all__ = ["TILE", "WEIGHT", "Peaks", "filtered", "find_peaks", "halve", "wide"]
+__all__ = ["TILES", "WEIGHT", "Peaks", "filtered", "find_peaks", "halve", "wide"]
