@@ -184,7 +184,10 @@ def _brightest_of(array: np.ndarray, peaks: Peaks, level: int, threshold: float)
 
 @dataclass(frozen=True)
 class _Windows:
-    """Windows of n places at one level: inner (n, m, m) pixels, ring (n, k) pixels around, filled (n, m, m) what says nothing."""
+    """Windows of n places at one level: inner (n, m, m) pixels, ring (n, k) pixels around, filled (n, m, m) what says nothing.
+
+    noise: (n,) spread of the ring; grain: (n,) the same without what is smooth.
+    """
 
     inner: np.ndarray
     ring: np.ndarray
@@ -193,6 +196,7 @@ class _Windows:
     outside: np.ndarray
     sky: np.ndarray
     noise: np.ndarray
+    grain: np.ndarray
     above: np.ndarray
     x0: np.ndarray
     y0: np.ndarray
@@ -219,7 +223,11 @@ def _windows(
     core = above[:, half - 2 : half + 3, half - 2 : half + 3] + 1e-9
     d, total = np.arange(-2, 3), core.sum(axis=(1, 2))
     x0, y0 = (core.sum(axis=1) * d).sum(axis=1) / total, (core.sum(axis=2) * d).sum(axis=1) / total
-    return _Windows(inner, ring, full, full | outside, outside, sky, noise, above, x0, y0)
+    # From pixel to pixel along the border's rows and columns: structure that is smooth does not count as noise here.
+    steps = [np.diff(w[:, [0, -1], :], axis=2), np.diff(w[:, :, [0, -1]], axis=1)]
+    steps = np.sort(np.abs(np.concatenate([d.reshape(len(w), 2 * w.shape[1] - 2) for d in steps], axis=1)), axis=1)
+    grain = np.minimum(noise, np.maximum(steps[:, int(0.6827 * steps.shape[1])] / np.sqrt(2.0), floor))
+    return _Windows(inner, ring, full, full | outside, outside, sky, noise, grain, above, x0, y0)
 
 
 @cache
@@ -260,8 +268,8 @@ def _in_structure(w: _Windows, half: int) -> np.ndarray:
     ring = (w.ring - w.sky[:, None])[:, order]
     most = np.maximum.reduceat(ring, starts, axis=1)
     mean = np.add.reduceat(ring, starts, axis=1) / np.diff(np.append(starts, ring.shape[1]))
-    ridge = (np.minimum(most[:, :4], most[:, 4:]) > (0.3 * peak + 3.5 * w.noise)[:, None]).any(axis=1)
-    return ridge | ((np.abs(mean) > (0.2 * peak + w.noise)[:, None]).sum(axis=1) >= 3)
+    ridge = (np.minimum(most[:, :4], most[:, 4:]) > (0.3 * peak + 3.5 * w.grain)[:, None]).any(axis=1)
+    return ridge | ((np.abs(mean) > (0.2 * peak + w.grain)[:, None]).sum(axis=1) >= 3)
 
 
 def _measure(
