@@ -16,12 +16,12 @@ import numpy as np
 from .patterns import EMPTY, FAINT, RUNG, SHORTEST, Level, Pairs, SkyMap
 from .verify import Detections, Freedom
 
-FIRST_TEST, ALL_TESTS = 10, 120
-"""Detections that every hypothesis is tried on, and those that a promising one is tried on."""
-FIRST_KEPT = 400
-"""Hypotheses of a chunk that get all tests."""
-MOST_PAIRED, MOST_PAIRED_KNOWN = 26, 100
-"""Detections that are paired; the second where calibrated magnitudes leave few catalogue pairs for each."""
+FIRST_TEST, FIRST_KEPT, FEW = 10, 400, 1500
+"""Detections that every hypothesis is tried on, and the number of hypotheses that are then tried on all; of FEW or more
+hypotheses in a chunk, twice as many detections and at least a twentieth."""
+MOST_PAIRED, MOST_PAIRED_LATER, MOST_PAIRED_KNOWN = 26, 50, 100
+"""Detections that are paired at first; when those are exhausted; and where calibrated magnitudes leave few catalogue pairs for
+each."""
 FIRST_CHUNK, CHUNK = 2000, 24000
 """Candidate catalogue pairs that are looked at in one go."""
 PAIR_GATE, MAGNITUDE_GATE = 3.0, 2.2
@@ -41,14 +41,18 @@ class Hypotheses:
     score: np.ndarray
 
 
-def detection_pairs(d: Detections) -> np.ndarray:
-    """(m, 2) indices of pairs to try, the brightest first, neither too short for a good lever nor too long for the tables."""
+def detection_pairs(d: Detections, later: bool = False) -> np.ndarray:
+    """(m, 2) indices of pairs to try, the brightest first, neither too short for a good lever nor too long for the tables.
+
+    later: those that the first call left out.
+    """
     calibrated = d.zero_point is not None and d.magnitude is not None
-    n = min(len(d), MOST_PAIRED_KNOWN if calibrated else MOST_PAIRED)
+    at_first = MOST_PAIRED_KNOWN if calibrated else MOST_PAIRED
+    n = min(len(d), max(at_first, MOST_PAIRED_LATER) if later else at_first)
     i, j = np.triu_indices(n, 1)
     length = np.hypot(*(d.xy[i] - d.xy[j]).T)
     field = np.sqrt(d.area)
-    keep = (length > 1.5 * SHORTEST * field) & (length < FIELD_REACH * field)
+    keep = (length > 1.5 * SHORTEST * field) & (length < FIELD_REACH * field) & ((j >= at_first) | (not later))
     i, j, length = i[keep], j[keep], length[keep]
     # Sums of ranks, not the later rank: one false bright object must not spoil the first n - 1 trials.
     order = np.argsort(i + j + 0.5 * np.abs(length / field - 0.35), kind="stable")
@@ -190,11 +194,13 @@ def _rank(level: Level, d: Detections, i, j, a, b, zero, freedom: Freedom, keep:
     R = _rotations(d, i, j, fs, va, vb)
     R[2] *= fs
     sky_map = level.sky_map(FAINT, tolerance_px(d, freedom) / float(np.median(f)))
-    tests = np.arange(len(d))
-    score = _score(sky_map, d, R, zero, tests[:FIRST_TEST])
-    best = _largest(score, max(FIRST_KEPT, keep))
-    if len(d) > FIRST_TEST:
-        more = _score(sky_map, d, R[:, :, best], None if zero is None else zero[best], tests[FIRST_TEST:ALL_TESTS])
+    # The first test takes bright and faint ones alike: the brightest few may all be false.
+    tests = np.concatenate([np.arange(k, len(d), 3) for k in range(3)]).astype(int)
+    first, kept = (FIRST_TEST, FIRST_KEPT) if len(f) < FEW else (2 * FIRST_TEST, max(FIRST_KEPT, len(f) // 20))
+    score = _score(sky_map, d, R, zero, tests[:first])
+    best = _largest(score, max(kept, keep))
+    if len(d) > first:
+        more = _score(sky_map, d, R[:, :, best], None if zero is None else zero[best], tests[first:])
         score[best] += more
     best = best[_largest(score[best], keep)]
     va, vb = (level.directions[k[best]].T for k in (a, b))
@@ -223,8 +229,9 @@ def _score(sky_map: SkyMap, d: Detections, R: np.ndarray, zero: np.ndarray | Non
     z = MAGNITUDES.take(found)
     z -= d.magnitude[tests].astype(np.float32)
     z -= zero[:, None]
+    z *= np.float32(0.45 / np.hypot(1.3 * d.magnitude_sigma, 0.05))
     z *= z
-    z *= np.float32(0.12 / ((1.3 * d.magnitude_sigma) ** 2 + 0.05**2))
+    z *= z
     z += np.float32(1.0)
     return np.reciprocal(z, out=z).sum(axis=1)
 

@@ -23,7 +23,7 @@ FEWEST = 3
 """Stars that a solution must match; with a known zero point of magnitudes 2 may do."""
 LIMIT = 1e-6
 """Default of the largest probability that a solution is false."""
-AT_ONCE, KEPT, POOL = 2, 10, 150
+AT_ONCE, KEPT, POOL = 2, 20, 300
 """Hypotheses of each chunk that are verified at once, that are kept, and that are verified when a table is exhausted."""
 WORK = 3_000_000
 """Catalogue pairs that are looked at before the search gives up."""
@@ -215,10 +215,13 @@ def search(sky: Sky, d: Detections, freedom: Freedom, fewest: int, limit: float,
     enough = min(limit, LIMIT)
     fits: list[Fit] = []
     done = 0
-    pairs = detection_pairs(d)
     levels = levels_for(d, freedom, LADDER)
-    block = 3 if freedom.free else max(len(pairs), 1)
-    for n in (BRIGHTEST, BRIGHT, FAINT) if freedom.free else (BRIGHT, FAINT):
+    at_first, later = detection_pairs(d), detection_pairs(d, later=True)
+    stages = [(BRIGHT, at_first), (BRIGHT, later), (FAINT, at_first)]
+    if freedom.free:
+        stages = [(BRIGHTEST, at_first), *stages]
+    block = 3 if freedom.free else 10_000
+    for n, pairs in stages:
         pool: list[tuple[float, int, np.ndarray, float]] = []
         for begin in range(0, len(pairs), block):
             for k, part in levels:
@@ -246,8 +249,10 @@ def search(sky: Sky, d: Detections, freedom: Freedom, fewest: int, limit: float,
 
 def try_all(sky: Sky, d: Detections, ranked, freedom: Freedom, fits: list[Fit], fewest: int, limit: float) -> bool:
     """Verify hypotheses (score, level, R, f) and add the fits to the list; True once one is convincing."""
+    closest = 2.0 * float(np.median(d.sigma))
     for _, k, R, f in ranked:
-        if any(same(R, f, fit) for fit in fits):
+        # A hypothesis on top of a fit would lead there again. Not so one nearby: a short pair may have led to a poor fit.
+        if any(same(R, f, fit, closest / f, 1e-3) for fit in fits):
             continue
         fit = verify(sky, k, d, R, f, freedom)
         if fit is None or len(fit.stars) < fewest:
@@ -258,9 +263,9 @@ def try_all(sky: Sky, d: Detections, ranked, freedom: Freedom, fits: list[Fit], 
     return False
 
 
-def same(R: np.ndarray, f: float, fit: Fit) -> bool:
-    """Whether a hypothesis is within 1 deg and 2% of a fit."""
-    return abs(f / fit.f - 1.0) < 0.02 and float((R * fit.R).sum()) > 3.0 - 3e-4
+def same(R: np.ndarray, f: float, fit: Fit, angle: float = 0.017, ratio: float = 0.02) -> bool:
+    """Whether an attitude and focal length are within an angle (rad) and a ratio of a fit's."""
+    return abs(f / fit.f - 1.0) < ratio and float((R * fit.R).sum()) > 3.0 - angle**2
 
 
 def add(fits: list[Fit], fit: Fit) -> None:

@@ -210,7 +210,7 @@ def verify(
     f: float,
     freedom: Freedom,
     *,
-    first_gate: float = 3.0,
+    first_gate: float = 4.0,
     rounds: int = 3,
     volume: float = SO3_VOLUME,
 ) -> Fit | None:
