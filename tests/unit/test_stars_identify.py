@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from helmstar.attitude import quest
 from helmstar.stars import Pinhole, Sky, default_sky, identify, load_catalog, patterns, track
 from helmstar.stars.pinhole import ideal_pixels, image_pixels
 from helmstar.stars.synthetic import random_scene, scene
@@ -84,6 +85,18 @@ def test_the_covariance_is_honest():
         e = error(found, s.R_SN)
         values.append(e @ np.linalg.solve(found.covariance, e))
     assert 1.5 < np.mean(values) < 4.5
+
+
+def test_the_attitude_is_wahbas_optimum():
+    c = camera(14)
+    s = scene(default_sky(), c, np.random.default_rng(13), noise_px=0.5)
+    found = identify(s.xy_px, c, flux=s.flux, sigma_px=0.5, focal_sigma=0.0)
+    b = np.concatenate([ideal_pixels(c, s.xy_px[found.detections]), np.full((len(found.stars), 1), c.focal_px)], axis=1)
+    wahba = quest(b, default_sky().directions[found.stars], 0.5 / c.focal_px)
+    apart = (Rotation.from_quat(wahba.q_BN) * Rotation.from_quat(found.q_SN).inv()).as_rotvec()
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert (np.abs(apart) < 0.1 * sigma).all()
+    assert np.allclose(np.diag(wahba.covariance), np.diag(found.covariance), rtol=0.5)
 
 
 def test_pixels_need_not_be_square():

@@ -61,7 +61,7 @@ def detection_pairs(d: Detections, later: bool = False) -> np.ndarray:
 
 def tolerance_px(d: Detections, freedom: Freedom) -> float:
     """How far from its star a true detection may land under a hypothesis of a true pair, in px."""
-    return float(2.2 * 2.5 * np.median(d.sigma) + 0.25 * np.sqrt(d.area) * 2.5 * freedom.sigma)
+    return float(2.2 * 2.5 * d.typical_sigma + 0.25 * np.sqrt(d.area) * 2.5 * freedom.sigma)
 
 
 def separations(d: Detections, pairs: np.ndarray, f: float) -> np.ndarray:

@@ -61,7 +61,7 @@ def track(
     sky = default_sky() if sky is None else sky
     if len(d) < FEWEST:
         return unsolved("too few stars", 0)
-    sigma = float(np.median(d.sigma))
+    sigma = d.typical_sigma
     window = float(np.hypot(sigma, prior_sigma * camera.focal_px) / sigma)
     if window * sigma * 3.6 <= WIDEST_PX:
         level = levels_for(d, freedom, LADDER)[0][0]

@@ -37,6 +37,11 @@ GATE = 3.6
 """Residuals of matches, over sigma."""
 
 
+def middle(x: np.ndarray) -> float:
+    """Median, the upper one of an even number; np.median takes ten times as long for a few numbers."""
+    return float(np.partition(x, len(x) // 2)[len(x) // 2])
+
+
 @dataclass(frozen=True)
 class Detections:
     """What identification knows of an image; every array has its brightest entry first where brightness is known.
@@ -59,6 +64,10 @@ class Detections:
     @property
     def area(self) -> float:
         return float(np.prod(self.high - self.low))
+
+    @property
+    def typical_sigma(self) -> float:
+        return middle(self.sigma)
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -181,7 +190,7 @@ def magnitude_terms(
     dm = magnitude[i] - d.magnitude[j]
     s = d.magnitude_sigma
     if d.zero_point is None:
-        zero = float(np.median(dm))
+        zero = middle(dm)
         price = float(np.log(min(1.0, np.sqrt(2.0 * np.pi) * 1.25 * s / np.sqrt(len(dm)) / ZERO_POINT_RANGE)))
     else:
         zero, price = d.zero_point, 0.0
@@ -237,7 +246,7 @@ def verify(
 
 def _typical(fit: Fit, d: Detections) -> float:
     """Median residual of a fit over what the detections' sigmas promise."""
-    return float(np.median(np.sqrt((fit.residuals**2).sum(axis=1)) / d.sigma[fit.detections])) / 1.18
+    return middle(np.sqrt((fit.residuals**2).sum(axis=1)) / d.sigma[fit.detections]) / 1.18
 
 
 @dataclass(frozen=True)
