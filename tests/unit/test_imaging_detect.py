@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from helmstar.imaging import Camera, DetectionSettings, Image, detect
+from helmstar.imaging import Camera, DetectionSettings, Image, dark_of, detect
 from helmstar.imaging.render import Exposure, Glow, Truth, render
 
 CAMERA = Camera.from_fov(12.0, 640, 512)
@@ -172,6 +172,41 @@ def test_a_dark_takes_fixed_patterns_away():
     assert len(found) - len(i) <= 2
     with pytest.raises(ValueError, match="dark of shape"):
         detect(image, dark=pattern[:10])
+
+
+def test_a_dark_from_frames_on_moving_skies():
+    pattern = np.zeros((CAMERA.height, CAMERA.width))
+    pattern[40:480:60, 50:600:70] = 900.0
+    pattern[41:481:60, 50:600:70] = pattern[40:480:60, 51:601:70] = 500.0  # groups of hot pixels that look like stars
+    skies = [scene(20, 30 + k, Exposure(), faint=5.0) for k in range(4)]
+    frames = [Image(np.minimum(i.array + pattern, 4095).astype(np.uint16), i.saturation, 12) for i, _ in skies]
+    assert len(detect(frames[0])) > 60
+    dark = dark_of(frames)
+    assert 0.5 * (pattern > 0).sum() < (dark > 0).sum() < 1.5 * (pattern > 0).sum()
+    found = detect(frames[0], dark=dark)
+    i, _ = matched(found, skies[0][1])
+    assert len(i) >= 18
+    assert len(found) - len(i) <= 4
+    with pytest.raises(ValueError, match="at least 3"):
+        dark_of(frames[:2])
+
+
+@pytest.mark.parametrize("radius", [15, 40, 150])
+def test_the_moon_is_no_star(radius):
+    y, x = np.mgrid[:600, :800]
+    r = np.hypot(x - 400, y - 300)
+    sky = np.random.default_rng(0).normal(20, 3, r.shape) + 250 * (r < radius) + 60 * np.exp(-r / 120)
+    assert len(detect(Image(np.clip(sky, 0, 255).astype(np.uint8), 255.0, 8))) <= 1
+
+
+def test_values_that_are_none_are_dark():
+    image, truth = scene(15, 17, Exposure(), faint=5.0)
+    array = image.array.astype(np.float32)
+    array[200:230, 100:160] = np.nan
+    array[0, 0] = np.inf
+    i, _ = matched(detect(Image(array, image.saturation, 12)), truth)
+    assert len(i) >= 12
+    assert len(detect(Image(np.full((50, 50), np.nan, np.float32), 1.0, 16))) == 0
 
 
 def test_one_image_gives_the_same_stars_whatever_its_type():

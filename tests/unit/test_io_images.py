@@ -234,6 +234,7 @@ def test_any_bytes_are_data_errors(tmp_path_factory, tail, magic):
 
 
 def test_reading_and_detecting_load_nothing_heavy():
-    code = "import helmstar.io.images, helmstar.imaging, sys; print([m for m in ('jax', 'pydantic', 'pandas', 'scipy') if m in sys.modules])"
+    heavy = ("jax", "pydantic", "pandas", "scipy")
+    code = f"import helmstar.io.images, helmstar.imaging, sys; print([m for m in {heavy} if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"

@@ -4,7 +4,7 @@
 """
 
 from .camera import Camera, read_camera, write_camera
-from .detect import DetectionSettings, detect
+from .detect import DetectionSettings, dark_of, detect
 from .frame import Centroids, Image
 
-__all__ = ["Camera", "Centroids", "DetectionSettings", "Image", "detect", "read_camera", "write_camera"]
+__all__ = ["Camera", "Centroids", "DetectionSettings", "Image", "dark_of", "detect", "read_camera", "write_camera"]

@@ -78,13 +78,13 @@ def _factors(
 
 
 def fit(
-    windows: np.ndarray, x: np.ndarray, y: np.ndarray, sky: np.ndarray, noise: np.ndarray, width: float, filled: np.ndarray,
+    windows: np.ndarray, x: np.ndarray, y: np.ndarray, sky: np.ndarray, noise: np.ndarray, width: np.ndarray, filled: np.ndarray,
     tight: float = _LOOSE,
 ) -> Fit:  # fmt: skip
     """Fit every window (n, m, m), m odd, from starts x, y (n,) relative to the middle pixel.
 
-    sky, noise: (n,) from around the window; the sky is known as well as the noise of 2 m pixels allows. width: expected sigma
-    of the stars, px, relative spread `tight`. filled: (n, m, m) bool, pixels that say nothing.
+    sky, noise: (n,) from around the window; the sky is known as well as the noise of 2 m pixels allows. width: (2,) expected
+    sigma of the stars along x and y, px, relative spread `tight`. filled: (n, m, m) bool, pixels that say nothing.
     """
     n, m, _ = windows.shape
     half = m // 2
@@ -93,10 +93,10 @@ def fit(
     p = np.empty((n, 6))
     p[:, 0] = np.maximum(np.where(filled, 0.0, data - sky[:, None, None]).sum(axis=(1, 2)), noise)
     p[:, 1], p[:, 2], p[:, 3], p[:, 4:] = sky, x, y, width
-    expected = np.concatenate([np.zeros((n, 1)), sky[:, None], np.zeros((n, 2)), np.full((n, 2), width)], axis=1)
+    expected = np.concatenate([np.zeros((n, 1)), sky[:, None], np.zeros((n, 2)), np.tile(width, (n, 1))], axis=1)
     prior = np.zeros((n, 6))
     prior[:, 1] = 2.0 * m
-    prior[:, 4:] = (np.maximum(noise, 1e-9) ** 2 / (tight * width) ** 2)[:, None]
+    prior[:, 4:] = np.maximum(noise, 1e-9)[:, None] ** 2 / (tight * width) ** 2
     low, high = np.array([-np.inf, -half, -half, MIN_SIGMA, MIN_SIGMA]), np.array([np.inf, half, half, half, half])
     going = np.arange(n)
     for k in range(ITERATIONS):

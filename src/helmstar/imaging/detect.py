@@ -6,14 +6,16 @@ A place is no star if its light is one pixel's (hot pixel) or one row's or colum
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
+from .background import between, mesh_of
 from .centroid import Fit, fit, gain_of
 from .frame import Centroids, Image
-from .pyramid import Peaks, find_peaks, halve
+from .pyramid import TILES, Peaks, find_peaks, halve
 
 HALF = (3, 5, 9)
 """Half the side of a star's window at each level, px."""
@@ -63,10 +65,14 @@ def detect(image: Image, settings: DetectionSettings | None = None, dark: np.nda
         return _nothing()
     if array.dtype != np.uint8:
         array = array.astype(np.float32)
+        if not np.isfinite(array.sum()):  # numbers without value shine nowhere
+            finite = np.isfinite(array)
+            array = np.where(finite, array, np.median(array[finite]) if finite.any() else 0.0).astype(np.float32)
     quantum = 1.0 if image.array.dtype.kind == "u" else 0.0
     quantum = max(quantum, 1e-12)
     found: list[tuple[np.ndarray, ...]] = []
-    width, binned = 0.0, array
+    width: np.ndarray | None = None
+    binned = array
     places: tuple[np.ndarray, ...] = ()
     for k in range(s.levels):
         if min(binned.shape) < 40:
@@ -77,7 +83,7 @@ def detect(image: Image, settings: DetectionSettings | None = None, dark: np.nda
             continue
         places = _merged(found, s)
         width = _optics(array, image, *places[:4])
-        if width and width < _COARSE:  # sharp stars: the coarsest level would show only structure
+        if width is not None and width.max() < _COARSE:  # sharp stars: the coarsest level would show only structure
             break
         if k + 1 < s.levels:
             binned = halve(binned)
@@ -86,9 +92,9 @@ def detect(image: Image, settings: DetectionSettings | None = None, dark: np.nda
     x, y, level, snr, floor = places or _merged(found, s)
     if not len(x):
         return _nothing()
-    if width:
+    if width is not None:
         # A faint star shows best at the scale of the optics: what only a coarser one sees is structure, unless it is bright.
-        best = int(np.argmin(np.abs(np.log(np.array(_WIDTH) / width))))
+        best = int(np.argmin(np.abs(np.log(np.array(_WIDTH) ** 2 / width.prod()))))
         keep = (level <= best) | (snr > _BRIGHT)
         x, y, level, snr, floor = (c[keep] for c in (x, y, level, snr, floor))
         # A window as wide as the optics need; a wider one only for what is full, whose light reaches farther.
@@ -102,6 +108,23 @@ def detect(image: Image, settings: DetectionSettings | None = None, dark: np.nda
     whole = Centroids(**{f: np.concatenate([getattr(p, f) for p in parts]) for f in vars(parts[0])})
     whole = whole.take(np.argsort(-whole.flux, kind="stable"))
     return whole.take(_alone(whole)[: s.max_stars])
+
+
+def dark_of(images: Sequence[Image]) -> np.ndarray:
+    """A dark frame (height, width), float32, for `detect`, from three or more frames of one camera and setting on moving skies.
+
+    Their median pixel by pixel, less its own sky, where that stands out: what shines in the same place in most of them is no
+    star. Elsewhere zero, so that no noise is added. Raises ValueError for fewer frames or different shapes.
+    """
+    shapes = {i.array.shape for i in images}
+    if len(images) < 3 or len(shapes) != 1:
+        raise ValueError(f"{len(images)} images of shapes {sorted(shapes)}: a dark needs at least 3 of one shape")
+    shape = images[0].array.shape
+    middle = np.median(np.stack([i.array for i in images]), axis=0).astype(np.float32)
+    mesh = mesh_of(middle[::4, ::4], shape, TILES[0], 0.3 if images[0].array.dtype.kind == "u" else 0.0)
+    grid = np.arange(shape[0]), np.arange(shape[1])
+    rise = middle - between(mesh.sky, shape, *grid)
+    return np.where(rise > 6.0 * between(mesh.noise, shape, *grid), rise, np.float32(0.0))
 
 
 def _nothing() -> Centroids:
@@ -248,17 +271,19 @@ def _sectors(half: int) -> tuple[np.ndarray, np.ndarray]:
     return order, np.searchsorted(number[order], np.arange(8))
 
 
-def _optics(array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, level: np.ndarray, snr: np.ndarray) -> float:
-    """Sigma of the optics, px, from the brightest places that are not saturated; 0 where too few say."""
+def _optics(
+    array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, level: np.ndarray, snr: np.ndarray
+) -> np.ndarray | None:
+    """Sigma (2,) of the optics along x and y, px, from the brightest places that are not saturated; None where too few say."""
     some = np.flatnonzero((snr > _BRIGHT) & (level < 2))[:_FOR_WIDTH]
     if some.size < 3:
-        return 0.0
+        return None
     w = _windows(array, image, x[some], y[some], HALF[1], 1e-9)
     clear = ~w.filled.any(axis=(1, 2)) & ~_in_structure(w, HALF[1])
     if clear.sum() < 3:
-        return 0.0
-    f = fit(w.inner[clear], w.x0[clear], w.y0[clear], w.sky[clear], w.noise[clear], 1.0, w.filled[clear], 0.5)
-    return float(np.median(f.sigma))
+        return None
+    f = fit(w.inner[clear], w.x0[clear], w.y0[clear], w.sky[clear], w.noise[clear], np.ones(2), w.filled[clear], 0.5)
+    return np.median(f.sigma, axis=0)
 
 
 def _in_structure(w: _Windows, half: int) -> np.ndarray:
@@ -274,7 +299,7 @@ def _in_structure(w: _Windows, half: int) -> np.ndarray:
 
 def _measure(
     array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, snr: np.ndarray, floor: np.ndarray, level: int,
-    width: float, s: DetectionSettings, quantum: float,
+    width: np.ndarray | None, s: DetectionSettings, quantum: float,
 ) -> Centroids:  # fmt: skip
     """Fit the places of one level and keep those that are stars."""
     half = HALF[level]
@@ -285,7 +310,8 @@ def _measure(
         return _nothing()
     x, y, snr, floor = x[calm], y[calm], snr[calm], floor[calm]
     w = _Windows(**{k: v[calm] for k, v in vars(w).items()})
-    f = fit(w.inner, w.x0, w.y0, w.sky, w.noise, width or _WIDTH[level], w.filled, 0.25 if width else 0.35)
+    expected = np.full(2, _WIDTH[level]) if width is None else width
+    f = fit(w.inner, w.x0, w.y0, w.sky, w.noise, expected, w.filled, 0.25 if width is not None else 0.35)
     clear = (snr > _BRIGHT) & ~w.filled.any(axis=(1, 2))
     gain = s.gain if s.gain is not None else gain_of(f, w.noise, clear)
     # Noise with a pattern (mosaics, JPEG) is larger in sums of pixels than its pixels say; the filtered image shows it.
@@ -342,4 +368,4 @@ def _alone(stars: Centroids) -> np.ndarray:
     return np.flatnonzero(~np.any(same & brighter, axis=1))
 
 
-__all__ = ["HALF", "DetectionSettings", "detect"]
+__all__ = ["HALF", "DetectionSettings", "dark_of", "detect"]
