@@ -23,8 +23,8 @@ import numpy as np
 
 from .patterns import Sky
 
-BROAD_SHARE, BROAD_SIGMA = 0.15, 1.5
-"""Share and 1 sigma (mag) of matches whose magnitude is not what the catalogue says."""
+BROAD_SHARE, BROAD_SIGMA, BROAD_FACTOR = 0.15, 1.5, 6.0
+"""Share of matches whose magnitude is not what the catalogue says, and their 1 sigma: in mag, at most so many times the usual."""
 ZERO_POINT_RANGE = 10.0
 """Where an unknown zero point may lie (mag, full width): sets the price of fitting it."""
 LOG_FACTORIAL = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1.0, 400.0)))])
@@ -196,7 +196,8 @@ def magnitude_terms(
         zero, price = d.zero_point, 0.0
     z = dm - zero
     density = (1.0 - BROAD_SHARE) / s * np.exp(-0.5 * (z / s) ** 2)
-    density += BROAD_SHARE / BROAD_SIGMA * np.exp(-0.5 * (z / BROAD_SIGMA) ** 2)
+    broad = min(BROAD_SIGMA, BROAD_FACTOR * s)
+    density += BROAD_SHARE / broad * np.exp(-0.5 * (z / broad) ** 2)
     return np.log(density / np.sqrt(2.0 * np.pi) + 1e-6) - d.log_magnitude_density[j], zero, price
 
 
