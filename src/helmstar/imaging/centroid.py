@@ -79,7 +79,7 @@ def _factors(
 
 def fit(
     windows: np.ndarray, x: np.ndarray, y: np.ndarray, sky: np.ndarray, noise: np.ndarray, width: np.ndarray, filled: np.ndarray,
-    tight: float = _LOOSE,
+    tight: float = _LOOSE, iterations: int = ITERATIONS,
 ) -> Fit:  # fmt: skip
     """Fit every window (n, m, m), m odd, from starts x, y (n,) relative to the middle pixel.
 
@@ -99,7 +99,7 @@ def fit(
     prior[:, 4:] = np.maximum(noise, 1e-9)[:, None] ** 2 / (tight * width) ** 2
     low, high = np.array([-np.inf, -half, -half, MIN_SIGMA, MIN_SIGMA]), np.array([np.inf, half, half, half, half])
     going = np.arange(n)
-    for k in range(ITERATIONS):
+    for k in range(iterations):
         q = p[going]
         U, V = _factors(q[:, 2], q[:, 3], q[:, 0], q[:, 4:], half)
         rest = data[going] - (q[:, 0, None] * U[:, 0])[:, :, None] * V[:, 0, None, :] - q[:, 1, None, None]
@@ -111,7 +111,8 @@ def fit(
         p[going, 0] = np.maximum(q[:, 0] + step[:, 0], 0.1 * q[:, 0])
         p[going, 1:] = np.clip(q[:, 1:] + step[:, 1:], low, high)
         if k:
-            going = going[np.abs(step[:, 2:4]).max(axis=1) > _STILL]
+            least = np.minimum(A[:, 2, 2], A[:, 3, 3])  # a tenth of what noise leaves, or the absolute bound
+            going = going[np.abs(step[:, 2:4]).max(axis=1) > np.maximum(_STILL, 0.1 * noise[going] / np.sqrt(least))]
             if not going.size:
                 break
     U, V = _factors(p[:, 2], p[:, 3], p[:, 0], p[:, 4:], half)

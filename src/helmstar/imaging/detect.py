@@ -282,7 +282,7 @@ def _optics(
     clear = ~w.filled.any(axis=(1, 2)) & ~_in_structure(w, HALF[1])
     if clear.sum() < 3:
         return None
-    f = fit(w.inner[clear], w.x0[clear], w.y0[clear], w.sky[clear], w.noise[clear], np.ones(2), w.filled[clear], 0.5)
+    f = fit(w.inner[clear], w.x0[clear], w.y0[clear], w.sky[clear], w.noise[clear], np.ones(2), w.filled[clear], 0.5, 4)
     return np.median(f.sigma, axis=0)
 
 

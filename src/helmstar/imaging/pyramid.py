@@ -82,6 +82,8 @@ def find_peaks(array: np.ndarray, level: int, threshold: float, quantum: float) 
     floor = quantum / np.sqrt(12.0) * 2**level * _NOISE
     mesh = mesh_of(_sampled(array, stride, out), (h - 2, w - 2), tile, floor)
     limits = mesh.limit(threshold, _ROWS)
+    if out == np.uint16:  # one type on both sides is compared many pixels at a time
+        limits = np.clip(np.floor(limits), 0, np.iinfo(np.uint16).max).astype(np.uint16)
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for top in range(0, h - 2, _BAND):  # rows of the filtered image, with one more on each side for their neighbours
         bottom = min(top + _BAND, h - 2)
