@@ -298,12 +298,7 @@ def conclude(
         return unsolved("no match" if best.log_odds < 0.0 else "uncertain", done, p_false, best.log_odds)
     R, f, P, residuals = polish(sky, d, covariances[best.detections], best, freedom)
     q_SN = quaternion_of_matrix(R)
-    if q_SB is None:
-        q_BN = q_SN
-    else:
-        from scipy.spatial.transform import Rotation
-
-        q_BN = (Rotation.from_quat(q_SB).inv() * Rotation.from_quat(q_SN)).as_quat()
+    q_BN = q_SN if q_SB is None else quaternion_of_matrix(matrix_of_quaternion(np.asarray(q_SB, dtype=float)).T @ R)
     z = R[2]
     ra, dec = float(np.arctan2(z[1], z[0]) % (2.0 * np.pi)), float(np.arcsin(np.clip(z[2], -1.0, 1.0)))
     # The north pole seen in S: its angle from -y, positive towards -x.
