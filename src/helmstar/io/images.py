@@ -21,6 +21,7 @@ MAX_BYTES = 1 << 30
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP")
 _REMEDY = "give a PNG, JPEG, TIFF, BMP or FITS image"
 _DEPTHS = (10, 12, 14, 16)
+_SHARED = 3
 _CFA_PATTERN = 33422  # TIFF/EP tag
 
 
@@ -53,7 +54,7 @@ def read_image(path: Path | str, *, bayer: bool | None = None) -> Image:
         raise DataError(f"{path}: needs more memory than there is; cut or bin it") from None
     if min(array.shape[:2]) < 1:
         raise DataError(f"{path}: has no pixels; {_REMEDY}")
-    grey, saturation = _grey(path, array, bits)
+    grey, saturation = _grey(path, array, bits, _stated(metadata))
     if mosaic if bayer is None else bayer:
         grey, saturation = _smoothed(grey), 16.0 * saturation
     return Image(grey, saturation, bits, metadata)
@@ -102,8 +103,8 @@ def _fits(path: Path) -> tuple[np.ndarray, int, dict[str, str], bool]:
     return array, image.bits, {"format": "FITS", **image.header}, "BAYERPAT" in image.header
 
 
-def _grey(path: Path, array: np.ndarray, bits: int) -> tuple[np.ndarray, float]:
-    """One plane, uint8, uint16 or float32, and the value at which its pixels are full."""
+def _grey(path: Path, array: np.ndarray, bits: int, full: float) -> tuple[np.ndarray, float]:
+    """One plane, uint8, uint16 or float32, and the value at which its pixels are full: `full` for numbers of other kinds."""
     if array.dtype.kind not in "uif" or array.dtype.itemsize > 8:
         raise DataError(f"{path}: has pixels of type {array.dtype}; save it with 8 or 16 bits")
     if array.ndim == 3 and (array.shape[2] == 1 or all((array[..., 0] == array[..., k]).all() for k in (1, 2))):
@@ -123,16 +124,24 @@ def _grey(path: Path, array: np.ndarray, bits: int) -> tuple[np.ndarray, float]:
         raise DataError(f"{path}: holds no number in any pixel; save it again")
     if not finite.all():
         values[~finite] = np.median(values[finite])
-    return np.ascontiguousarray(values), float(values.max())
+    return np.ascontiguousarray(values), full
+
+
+def _stated(metadata: dict[str, str]) -> float:
+    """FITS SATURATE, or infinity: numbers that are no counts have no natural limit."""
+    try:
+        return float(metadata["SATURATE"])
+    except (KeyError, ValueError):
+        return float("inf")
 
 
 def _full(array: np.ndarray, bits: int) -> float:
-    """255, or what a sensor of 10 to 16 bits gives at most when its numbers stand in 16."""
+    """255; for 16 bits the largest value, where several pixels share it and a sensor of 10 to 16 bits ends near it."""
     if bits == 8:
         return 255.0
     most = int(array.max())
-    depth = next(d for d in _DEPTHS if most < 1 << d)
-    return float((1 << depth) - 1)
+    ends = any(0.9 * (1 << d) <= most < 1 << d for d in _DEPTHS)
+    return float(most) if ends and np.count_nonzero(array == most) >= _SHARED else 65535.0
 
 
 def _smoothed(grey: np.ndarray) -> np.ndarray:
