@@ -97,12 +97,18 @@ def judge(e: Array, S: Array, rows: Array, gate: Gate, refused: Array) -> tuple[
     return V, nis, dof, status, (status == ACCEPTED) | (status == FORCED)
 
 
-def grow(cov: Array, nis: Array, R: Array, S: Array, status: Array) -> Array:
+def grow(cov: Array, nis: Array, R: Array, S: Array, status: Array, constant: tuple[int, ...] = ()) -> Array:
     """A belief whose measurements were refused again and again was too sure of itself: its covariance grows by NIS over
-    the degrees of freedom that it explains, sum(1 - R_ii / S_ii), so that the gate opens for the measurements that follow."""
+    the degrees of freedom that it explains, sum(1 - R_ii / S_ii), so that the gate opens for the measurements that follow.
+    `constant` states, which no upset changes, keep their variance."""
     explained = jnp.sum(1.0 - jnp.diagonal(R) / jnp.diagonal(S))
     factor = jnp.maximum(nis / jnp.maximum(explained, jnp.finfo(cov.dtype).eps), 1.0)
-    return jnp.where(status == REOPENED, cov * factor, cov)
+    grown = cov * factor
+    if constant:
+        root = jnp.sqrt(factor) * jnp.ones(cov.shape[0], cov.dtype)
+        root = root.at[jnp.asarray(constant)].set(1.0)
+        grown = cov * root[:, None] * root[None, :]
+    return jnp.where(status == REOPENED, grown, cov)
 
 
 def doubt(R: Array, nis: Array, dof: Array, status: Array) -> Array:
@@ -132,11 +138,15 @@ class ErrorStateKalmanFilter:
     """EKF over any retraction. `iterations` > 1 iterates the update without using the measurement again.
 
     carry: see `carry_covariance`; an iterated update with "transport" carries by the Jacobian, as its covariance asks for.
+    constant: indices of error states that a reopening gate does not doubt (a calibration). considered: indices of states that
+    are not estimated but whose uncertainty counts (Schmidt-Kalman: their gain is zero); for one iteration.
     """
 
     retraction: Retraction
     carry: Carry = "transport"
     iterations: int = 1
+    constant: tuple[int, ...] = ()
+    considered: tuple[int, ...] = ()
 
     def predict(self, belief: Gaussian, process: Process, u: Any, dt: Array) -> tuple[Gaussian, Predicted]:
         """Belief after one step of dt seconds under the input u, and what a smoother needs of it."""
@@ -166,9 +176,11 @@ class ErrorStateKalmanFilter:
         HP = small.matmul(H, P)
         S = small.matmul(HP, small.transpose(H)) + R
         V, nis, dof, status, used = judge(e, S, rows, gate, refused)
-        P_grown = grow(P, nis, R, S, status)
+        P_grown = grow(P, nis, R, S, status, self.constant)
         info = information(e, S, V, rows, nis, dof, status)
         K = gain(V, HP)
+        if self.considered:
+            K = K.at[jnp.asarray(self.considered)].set(0.0)
         d = small.matvec(K, e)
         for _ in range(self.iterations - 1):
             y = r.boxplus(x, d)

@@ -8,9 +8,8 @@ too: they get the covariance `fresh`. Everything else is the inner filter's.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from ..backend import jax, jnp
 from ..core import ABSENT, GATED, RESET, Filter, Gate, Gaussian, Info, Measurement, Predicted, Process, Sensor, pytree
@@ -19,8 +18,18 @@ from ..geometry.retraction import Retraction, so3_left
 from .static import turn_covariance, wahba_start
 
 Array = jax.Array
-Restart = Callable[[Any, Sensor, Measurement], tuple[Any, Array]]
-"""(belief, sensor, measurement) -> (new belief, whether it is usable)."""
+
+
+class Restart(Protocol):
+    """A hashable rule that makes a new belief of a measurement."""
+
+    def serves(self, sensor: Sensor, m: Measurement) -> bool:
+        """Whether measurements of this kind can restart."""
+        ...
+
+    def __call__(self, belief: Any, sensor: Sensor, m: Measurement) -> tuple[Any, Array]:
+        """The new belief, and whether it is usable."""
+        ...
 
 
 @pytree
@@ -53,6 +62,10 @@ class RestartFromStars:
 
     retraction: Retraction = so3_left
 
+    def serves(self, sensor: Sensor, m: Measurement) -> bool:
+        """Two directions or more."""
+        return jnp.ndim(m.z) == 2 and jnp.shape(m.z)[0] > 1
+
     def __call__(self, belief: ResettableBelief, sensor: Sensor, m: Measurement) -> tuple[ResettableBelief, Array]:
         start = wahba_start(m.z, m.a, sensor.params.sigma, self.retraction, m.mask)
         ok = jnp.isfinite(start.cov).all()
@@ -67,8 +80,12 @@ class RestartFromAttitude:
 
     retraction: Retraction = so3_left
 
+    def serves(self, sensor: Sensor, m: Measurement) -> bool:
+        """A quaternion."""
+        return jnp.shape(m.z) == (4,)
+
     def __call__(self, belief: ResettableBelief, sensor: Sensor, m: Measurement) -> tuple[ResettableBelief, Array]:
-        if jnp.shape(m.z) != (4,):
+        if not self.serves(sensor, m):
             return belief, jnp.asarray(False)
         ok = jnp.all(m.mask) & jnp.isfinite(m.z).all() & jnp.isfinite(m.a).all()
         q = jnp.where(ok, m.z, belief.mean.q_BN)
@@ -95,11 +112,13 @@ class ResettingFilter:
 
     def update(self, belief: Any, sensor: Sensor, m: Measurement, gate: Gate, refused: Array) -> tuple[Any, Info]:
         """The inner filter's update, or a restart."""
-        closed = Gate(gate.limits, jnp.full_like(gate.reopen_after, jnp.iinfo(gate.reopen_after.dtype).max))
-        b, info = self.inner.update(Gaussian(belief.mean, belief.cov), sensor, m, closed, refused)
+        fresh, ok = self.restart(belief, sensor, m)
+        # A sensor that restarts nothing reopens its gate as without restarts.
+        never = jnp.full_like(gate.reopen_after, jnp.iinfo(gate.reopen_after.dtype).max)
+        own = Gate(gate.limits, never if self.restart.serves(sensor, m) else gate.reopen_after)
+        b, info = self.inner.update(Gaussian(belief.mean, belief.cov), sensor, m, own, refused)
         age = belief.age + jnp.where(info.status == ABSENT, 0, 1)
         kept = ResettableBelief(b.mean, b.cov, belief.fresh, age)
-        fresh, ok = self.restart(belief, sensor, m)
         due = (info.status == GATED) & (refused + 1 >= gate.reopen_after) & ok
         chosen = jax.tree.map(lambda a, b: jnp.where(due, a, b), fresh, kept)
         status = jnp.where(due, RESET, info.status)

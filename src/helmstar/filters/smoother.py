@@ -26,14 +26,20 @@ def _carry(retraction: Retraction, d: Array, P: Array) -> Array:
     return P if retraction.transport is None else small.congruence(retraction.transport(d), P)
 
 
-def smooth_step(retraction: Retraction, filtered: Gaussian, predicted: Predicted, later: Gaussian) -> Gaussian:
-    """Smoothed belief at k from the filtered one at k, the prediction of k + 1 from it, and the smoothed one at k + 1."""
+def smooth_step(
+    retraction: Retraction, filtered: Gaussian, predicted: Predicted, later: Gaussian, considered: tuple[int, ...] = ()
+) -> Gaussian:
+    """Smoothed belief at k from the filtered one at k, the prediction of k + 1 from it, and the smoothed one at k + 1.
+
+    considered: states whose gain is zero (see `ErrorStateKalmanFilter`)."""
     P, F = filtered.cov, predicted.F
     e = retraction.boxminus(later.mean, predicted.mean)
     P_later = _carry(retraction, -e, later.cov)
     FP = small.matmul(F, P)
     V = small.invert_lower(small.cholesky(predicted.cov))
     C = small.matmul(small.transpose(small.matmul(V, FP)), V)
+    if considered:
+        C = C.at[jnp.asarray(considered)].set(0.0)
     N = predicted.cov - small.matmul(FP, small.transpose(F))
     A = jnp.eye(retraction.dim, dtype=P.dtype) - small.matmul(C, F)
     cov = small.congruence(A, P) + small.congruence(C, P_later + N)
@@ -41,17 +47,18 @@ def smooth_step(retraction: Retraction, filtered: Gaussian, predicted: Predicted
     return Gaussian(retraction.boxplus(filtered.mean, d), small.symmetrise(_carry(retraction, d, cov)))
 
 
-@partial(jax.jit, static_argnames=("retraction",))
+@partial(jax.jit, static_argnames=("retraction", "considered"))
 def smooth(
-    retraction: Retraction, filtered: Any, predicted: Predicted, last: Any | None = None, breaks: Array | None = None
-) -> Gaussian:
+    retraction: Retraction, filtered: Any, predicted: Predicted, last: Any | None = None, breaks: Array | None = None,
+    considered: tuple[int, ...] = (),
+) -> Gaussian:  # fmt: skip
     """Smoothed beliefs of a whole track.
 
     filtered: beliefs after the updates, leading axis the step k = 0..N-1; predicted: predicted[k] leads to filtered[k]
     (as `run` records them). last: smoothed belief at N-1 when the track is part of a longer one, with predicted[0] of
     the later part unused; default the filtered one. breaks (N,): True where filtered[k] was started anew and owes nothing
-    to predicted[k], so that what is known later says nothing of what was before. Returns smoothed beliefs, same leading
-    axis.
+    to predicted[k], so that what is known later says nothing of what was before. considered: as in
+    `smooth_step`. Returns smoothed beliefs, same leading axis.
     """
     means, covs = filtered.mean, filtered.cov
     end = Gaussian(jax.tree.map(lambda a: a[-1], means), covs[-1]) if last is None else Gaussian(last.mean, last.cov)
@@ -59,7 +66,7 @@ def smooth(
     def body(later: Gaussian, inputs):
         mean, cov, predicted, broken = inputs
         own = Gaussian(mean, cov)
-        now = smooth_step(retraction, own, predicted, later)
+        now = smooth_step(retraction, own, predicted, later, considered)
         if broken is not None:
             now = jax.tree.map(lambda a, b: jnp.where(broken, a, b), own, now)
         return now, now

@@ -7,8 +7,8 @@ too large by a factor 1 + s:
 
     R_BN(k+1) = exp(-[omega dt x]) R_BN(k);  b as in `attitude`; mu and s are constant
 
-Error on the left for the attitude, sums for the rest. mu and s show only where the body turns: about an axis without rate the
-scale factor of that axis, and the misalignment about the direction of a rate that never changes, are not observable.
+Error on the left for the attitude, sums for the rest. mu and s show only where the rate changes: at a constant rate they look
+like drift, and about an axis that the body never turns about its scale factor is not observable at all.
 
 | symbol | meaning | shape, unit, frame |
 |---|---|---|

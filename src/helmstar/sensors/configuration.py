@@ -90,13 +90,22 @@ class GyroConfiguration(_Table):
     loss_policy: Literal[
         "interpolate", "hold_last", "hold_mean", "hold_mean_raised", "zeros", "commanded", "rate_state"
     ] = Field(default="interpolate", description="what stands for lost gyro data")
-    hold_s: Positive = Field(default=30.0, description="what hold_mean averages")
-    raised_deg_s: Positive = Field(default=0.5, description="1 sigma of a rate held with hold_mean_raised")
-    commanded_rate_deg_s: Annotated[list[Finite], Field(min_length=3, max_length=3)] | None = None
-    command_error: NotNegative = Field(
+    hold_s: Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)] = Field(
+        default=30.0, description="what hold_mean averages"
+    )
+    raised_deg_s: Annotated[float, Field(ge=1e-6, le=1e3, allow_inf_nan=False)] = Field(
+        default=0.5, description="1 sigma of a rate held with hold_mean_raised"
+    )
+    commanded_rate_deg_s: (
+        Annotated[
+            list[Annotated[float, Field(ge=-5e4, le=5e4, allow_inf_nan=False)]], Field(min_length=3, max_length=3)
+        ]
+        | None
+    ) = None
+    command_error: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = Field(
         default=0.01, description="1 sigma of the commanded rate, relative to its length"
     )
-    rate_sigma_deg_s: Positive | None = Field(
+    rate_sigma_deg_s: Annotated[float, Field(ge=1e-9, le=1e4, allow_inf_nan=False)] | None = Field(
         default=None, description="rate_state: random walk of the rate, deg/s/sqrt(s); None: what the record shows"
     )
 
@@ -214,9 +223,15 @@ class FilterConfiguration(_Table):
     restart: bool = Field(
         default=False, description="after so many refusals start anew from the attitude instead of opening the gate"
     )
-    restart_drift_sigma_deg_h: Positive = Field(
+    restart_drift_sigma_deg_h: Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)] = Field(
         default=1000.0, description="1 sigma of the drift after a restart that follows soon after another"
     )
+
+    @model_validator(mode="after")
+    def _restart_needs_a_gate(self) -> FilterConfiguration:
+        if self.restart and self.gate_probability == 0.0:
+            raise ValueError("restart = true needs a gate: with gate_probability = 0 nothing is ever refused")
+        return self
 
 
 class CalibrateConfiguration(_Table):

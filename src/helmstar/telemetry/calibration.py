@@ -5,8 +5,9 @@ Brought back to one instant (see `series`), neighbouring attitudes differ by wha
     log(D_k+1 D_k^-1) = integral of P^-1 (b - [omega x] mu + diag(omega) s) dt,
 
 which is linear in drift b, misalignment mu and scale factors s. The filter starts from the rates so corrected, so that its
-linearisation and its gate have little left to do. Whether the record shows a number at all is told by the bound: where its
-sigma at the end has not fallen below HALF of that before, it is not estimated.
+linearisation and its gate have little left to do. Whether the record shows a number at all is told by the bound, covariances
+along the measured rates: where its sigma at the end has not fallen to SHOWN of that before, it is not estimated, but its
+uncertainty goes on to count (a considered state). At a constant rate all six look like drift, and nothing is shown.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from .rates import RateSignal
 from .series import cumulative
 from .timeline import Epochs, build_timeline
 
-HALF = 0.5
+SHOWN = 0.3
 ROUNDS = 8
 NAMES = ("misalignment_x", "misalignment_y", "misalignment_z", "scale_x", "scale_y", "scale_z")
 """Of the six numbers, in order."""
@@ -124,4 +125,4 @@ def in_gyro_axes(e: Estimates, rough: np.ndarray) -> Estimates:
 
 def observed(prior: np.ndarray, bound: np.ndarray) -> np.ndarray:
     """Which of the numbers (6,) the record shows."""
-    return (prior > 0.0) & (bound < HALF * prior)
+    return (prior > 0.0) & (bound < SHOWN * prior)

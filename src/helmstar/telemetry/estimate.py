@@ -8,7 +8,7 @@ leaves the belief as it is.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from ..attitude import continuous
 from ..backend import jax, jnp
-from ..core import RESET, Gate, Gaussian, Measurement, Model
+from ..core import GATED, REOPENED, RESET, Gate, Gaussian, Measurement, Model, no_gate
 from ..filters import ErrorStateKalmanFilter, ResettableBelief, ResettingFilter, RestartFromAttitude, run, smooth
 from ..geometry import so3_left
 from ..geometry.retraction import euclidean, product
@@ -40,12 +40,13 @@ States = Literal["drift", "calibration", "rate"]
 @dataclass(frozen=True)
 class Design:
     """Which states are estimated and how: attitude and drift; with them misalignment and scale factors, of prior sigma
-    `calibration` (6,); or with them the rate, of random walk `rate_sigma` rad/s/sqrt(s), the gyro being a sensor. `restart`:
-    sigma of the drift (rad/s) after a second restart, None for a gate that opens instead. `commanded`: rates of gaps have
-    no drift."""
+    `calibration` (6,), of which those `considered` are not estimated but count as uncertainty; or with them the rate, of
+    random walk `rate_sigma` rad/s/sqrt(s), the gyro being a sensor. `restart`: sigma of the drift (rad/s) after a second
+    restart, None for a gate that opens instead. `commanded`: rates of gaps have no drift."""
 
     states: States = "drift"
     calibration: np.ndarray | None = None
+    considered: tuple[int, ...] = ()
     rate_sigma: float = 0.0
     restart: float | None = None
     commanded: bool = False
@@ -55,8 +56,15 @@ class Design:
         """Of its kind; equal designs have equal ones."""
         cls = {"drift": AttitudeDrift, "calibration": AttitudeCalibration, "rate": AttitudeRateDrift}[self.states]
         beside = {"drift": 1, "calibration": 3, "rate": 2}[self.states]
-        inner = ErrorStateKalmanFilter(product(cls, so3_left, *[euclidean(3)] * beside))
+        constant = tuple(range(6, 12)) if self.states == "calibration" else ()
+        inner = ErrorStateKalmanFilter(
+            product(cls, so3_left, *[euclidean(3)] * beside), constant=constant, considered=self._considered
+        )
         return inner if self.restart is None else ResettingFilter(inner, RestartFromAttitude())
+
+    @property
+    def _considered(self) -> tuple[int, ...]:
+        return tuple(6 + i for i in self.considered)
 
     @property
     def six(self) -> np.ndarray:
@@ -66,12 +74,16 @@ class Design:
 
 @dataclass(frozen=True)
 class Start:
-    """Belief at the timeline's first instant: q_BN (4,), attitude covariance (3, 3), drift (3,) rad/s, its sigma (3,)."""
+    """Belief at the timeline's first instant: q_BN (4,), attitude covariance (3, 3), drift (3,) rad/s, its sigma (3,).
+
+    measured_at: rate (3,) rad/s in B at which the drift was told by attitudes minus gyro, which takes what misalignment and
+    scale factors do at that rate for drift; None for a drift that is known from elsewhere."""
 
     q_BN: np.ndarray
     attitude_cov: np.ndarray
     drift: np.ndarray
     drift_sigma: np.ndarray
+    measured_at: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -89,7 +101,8 @@ class Estimates:
 @dataclass(frozen=True)
 class Updates:
     """Of each epoch of the timeline after the first: index (k,) into the timeline, nis, dof, status, residual (k, 3) in rad
-    in B (NaN for a single star direction), its sigma (k, 3)."""
+    in B (NaN for a single star direction), its sigma (k, 3). gyro_refused: steps whose gyro reading the gate refused, where
+    the gyro is a sensor."""
 
     index: np.ndarray
     nis: np.ndarray
@@ -97,6 +110,7 @@ class Updates:
     status: np.ndarray
     residual: np.ndarray
     sigma: np.ndarray
+    gyro_refused: int = 0
 
 
 def model_of(levels: NoiseLevels, directions: bool, design: Design) -> Model:
@@ -129,7 +143,8 @@ def _backward(filter: Any, begin: Any, track: Any, later: Gaussian) -> Gaussian:
     if isinstance(filter, ResettingFilter):
         anew = [info.status == RESET for info in track.infos]
         breaks = front(jnp.asarray(False), jnp.any(jnp.stack(anew), axis=0))
-    return smooth(filter.retraction, filtered, predicted, later, breaks)
+    inner: Any = filter.inner if isinstance(filter, ResettingFilter) else filter
+    return smooth(filter.retraction, filtered, predicted, later, breaks, inner.considered)
 
 
 class Record:
@@ -191,6 +206,11 @@ def initial_belief(start: Start, design: Design, rate: np.ndarray) -> Any:
     beside = np.concatenate(variances)
     P = np.zeros((3 + len(beside),) * 2)
     P[:3, :3], P[3:, 3:] = start.attitude_cov, np.diag(beside)
+    if design.states == "calibration" and start.measured_at is not None:
+        # What the two attitudes told is b + A x, with x misalignment and scale factors.
+        A, X = confused_with_drift(start.measured_at), P[6:, 6:]
+        P[3:6, 3:6] += A @ X @ A.T
+        P[3:6, 6:], P[6:, 3:6] = -A @ X, -(A @ X).T
     if design.restart is None:
         return Gaussian(mean, jnp.asarray(P))
     fresh = beside.copy()
@@ -198,10 +218,41 @@ def initial_belief(start: Start, design: Design, rate: np.ndarray) -> Any:
     return ResettableBelief(mean, jnp.asarray(P), jnp.asarray(np.diag(fresh)), jnp.asarray(0))
 
 
-def final_sigma(record: Record, start: Start, gate: Gate) -> np.ndarray:
-    """1 sigma (dim,) of every state at the record's end by a forward pass: the bound, at the rates that were measured."""
-    model, filter = model_of(record.levels, record.single, record.design), record.design.filter
-    belief = initial_belief(start, record.design, record.timeline.rate[0])
+def confused_with_drift(rate: np.ndarray) -> np.ndarray:
+    """A (3, 6): at a constant rate (3,) in B misalignment and scale factors x look like the drift A x, A = [-[w x], diag w]."""
+    x, y, z = rate
+    return np.concatenate([-np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), np.diag(rate)], axis=1)
+
+
+@dataclass(frozen=True)
+class _FixedMean:
+    """A filter that learns how well it could know, and nothing else: covariances along the prediction alone. An estimate
+    that moves would move the linearisation, and seem to know what it does not."""
+
+    inner: ErrorStateKalmanFilter
+
+    @property
+    def retraction(self) -> Any:
+        """The inner filter's."""
+        return self.inner.retraction
+
+    def predict(self, belief: Any, process: Any, u: Any, dt: Array) -> Any:
+        """The inner filter's."""
+        return self.inner.predict(belief, process, u, dt)
+
+    def update(self, belief: Any, sensor: Any, m: Measurement, gate: Gate, refused: Array) -> Any:
+        """The inner filter's covariance, at the mean that was predicted."""
+        b, info = self.inner.update(belief, sensor, m, gate, refused)
+        return Gaussian(belief.mean, b.cov), info
+
+
+def final_sigma(record: Record, start: Start) -> np.ndarray:
+    """1 sigma (dim,) of every state at the record's end that the record allows: the bound, at the rates that were measured
+    and at the start's attitude, drift and calibration throughout."""
+    gate = no_gate()
+    model = model_of(record.levels, record.single, record.design)
+    filter = _FixedMean(ErrorStateKalmanFilter(model.retraction, carry="none"))
+    belief = initial_belief(start, replace(record.design, restart=None), record.timeline.rate[0])
     refused = jnp.zeros(len(model.sensors), dtype=int)
     for i in range(record.chunks):
         u, dt, m = record.chunk(i)
@@ -220,18 +271,21 @@ def filter_and_smooth(
     model, filter = model_of(record.levels, record.single, design), design.filter
     belief = initial_belief(start, design, record.timeline.rate[0])
     refused = jnp.zeros(len(model.sensors), dtype=int)
-    begins, kept, infos = [], [_first(belief, design)], []
+    begins, kept, infos, gyro_refused = [], [_first(belief, design)], [], 0
     for i in range(record.chunks):
         begins.append((belief, refused))
         u, dt, m = record.chunk(i)
         belief, refused, track = _forward(filter, model, belief, refused, u, dt, m, gate)
         n = record.length(i)
         kept.append(_numbers(track.belief, n, design))
+        if design.states == "rate":
+            status = np.asarray(track.infos[0].status)[:n]
+            gyro_refused += int(np.sum((status == GATED) | (status == REOPENED)))
         infos.append(_info(track.infos[1 if design.states == "rate" else 0 :], n))
         advance()
     filtered = _joined(kept)
     smoothed = _smooth(record, model, begins, belief, gate, advance)
-    return filtered, smoothed, _updates(record, infos)
+    return filtered, smoothed, replace(_updates(record, infos), gyro_refused=gyro_refused)
 
 
 def _smooth(

@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from ..core import RESET
 from ..errors import DataError
 from ..files import readable
 from ..io.clock import Origin
@@ -14,21 +16,23 @@ from ..sensors.configuration import SensorsConfiguration
 from .solve import Solution
 
 
-def _segments(time: np.ndarray) -> list[slice]:
-    """Stretches of increasing times without a gap in them."""
-    starts = [0, *(int(np.searchsorted(time, gap.end)) for gap in find_gaps(time))]
-    return [slice(a, b) for a, b in zip(starts, [*starts[1:], len(time)])]
+def _segments(time: np.ndarray, restarts: np.ndarray) -> list[slice]:
+    """Stretches of increasing times without a gap or a restart in them; `restarts`: indices of the first times after one."""
+    starts = {0, *(int(np.searchsorted(time, gap.end)) for gap in find_gaps(time)), *restarts.tolist()}
+    order = sorted(starts)
+    return [slice(a, b) for a, b in zip(order, [*order[1:], len(time)])]
 
 
-def body_rate(solution: Solution, part: slice) -> np.ndarray:
-    """Rate of B relative to N in B (m, 3), rad/s, at the times of a stretch: the mean of the gyro's steps before and after
-    each within the stretch, less the drift."""
-    rate = solution.timeline.rate
-    low = min(part.start, len(rate) - 1)
-    high = max(part.stop - 2, low)
-    at = np.arange(part.start, part.stop)
-    beside = rate[np.clip(at - 1, low, high)] + rate[np.clip(at, low, high)]
-    return 0.5 * beside - solution.smoothed.drift[part]
+def body_rate(time: np.ndarray, q_BN: np.ndarray) -> np.ndarray:
+    """Rate of B relative to N in B (m, 3), rad/s, at times (m,) with attitudes (m, 4): the mean of the steps before and after.
+
+    From the attitudes themselves, whatever they were estimated with: R(t + dt) = exp(-[omega dt x]) R(t).
+    """
+    if len(time) < 2:
+        return np.zeros((len(time), 3))
+    R = Rotation.from_quat(q_BN)
+    steps = -(R[1:] * R[:-1].inv()).as_rotvec() / np.diff(time)[:, None]
+    return 0.5 * (np.concatenate([steps[:1], steps]) + np.concatenate([steps, steps[-1:]]))
 
 
 def write_exports(
@@ -44,7 +48,8 @@ def write_exports(
     """Smoothed attitude as CCSDS AEM and SPICE CK where asked for; names of the files by what they are."""
     out: dict[str, str] = {}
     time, q_BN = solution.timeline.time, solution.smoothed.q_BN
-    parts = _segments(time)
+    restarts = solution.updates.index[solution.updates.status == RESET]
+    parts = _segments(time, restarts)
     comments = ["Attitude estimated by helmstar from gyro and star tracker telemetry, smoothed.", command]
     if aem:
         from ..io.aem import write_aem
@@ -55,7 +60,7 @@ def write_exports(
     if ck:
         from ..io.spice_ck import CkSegment, write_ck
 
-        segments = [CkSegment(time[p], q_BN[p], body_rate(solution, p)) for p in parts]
+        segments = [CkSegment(time[p], q_BN[p], body_rate(time[p], q_BN[p])) for p in parts]
         files = write_ck(folder / "attitude.bc", origin, segments, sensors.spice, comments)
         out |= dict(zip(("ck", "sclk", "lsk"), map(str, files)))
     return out

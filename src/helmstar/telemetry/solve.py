@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -96,7 +96,11 @@ def _solve(telemetry: Telemetry, sensors: SensorsConfiguration, strict: bool, pr
         bar.finish(task)
     if not all(np.isfinite(x).all() for e in (filtered, smoothed) for x in (e.q_BN, e.drift, e.cov)):
         raise DataError("the filter did not stay finite; check the noise in sensors.toml against the data's units")
+    filtered, smoothed = (_doubted(e, updates) for e in (filtered, smoothed))
     problems += _refused(record.timeline, epochs, updates, gate)
+    if updates.gyro_refused:
+        message = f"{updates.gyro_refused} steps whose gyro rate does not fit the rate as a state; see rate_sigma_deg_s"
+        problems.append(Problem(gyro.files[0], int(gyro.row[0]), "jump", message, "dropped", updates.gyro_refused))
     check()
     if calibration is not None:
         filtered, smoothed = (in_gyro_axes(e, calibration.rough) for e in (filtered, smoothed))
@@ -117,50 +121,54 @@ class _Ready:
 
 
 def _ready(
-    signal: RateSignal, epochs: Epochs, sensors: SensorsConfiguration, gate: Gate, calibration: np.ndarray
+    signal: RateSignal, epochs: Epochs, sensors: SensorsConfiguration, gate: Gate, considered: tuple[int, ...] = ()
 ) -> _Ready:
-    """Start, noise and timeline of a record; `calibration` (6,): prior sigma of what is estimated beside the drift."""
+    """Start, noise and timeline of a record; `considered`: numbers of a calibration that are not estimated."""
     problems: list[Problem] = []
     signal = with_policy(signal, sensors.gyro)
     epochs, used, beginning, levels, sources = _begin(signal, epochs, sensors, gate, problems)
-    start, start_sources = _start(sensors, epochs, levels, beginning)
     timeline = build_timeline(signal, epochs)
-    record = Record(timeline, epochs, levels, used, _design(sensors, timeline, calibration))
+    start, start_sources = _start(sensors, epochs, levels, beginning, timeline, used)
+    record = Record(timeline, epochs, levels, used, _design(sensors, timeline, considered))
     return _Ready(record, start, sources | start_sources, problems)
 
 
 def _calibrated(
     signal: RateSignal, epochs: Epochs, sensors: SensorsConfiguration, gate: Gate
 ) -> tuple[_Ready, Calibration | None]:
-    """The record made ready, with what the record does not show of a calibration left out: bound first, estimate then."""
+    """The record made ready. Of a calibration first the bound, with all of its numbers unknown; what the record then shows
+    is estimated, and the rest counts as uncertainty."""
     prior = sensors.calibrate.sigma
     if not prior.any():
-        return _ready(signal, epochs, sensors, gate, prior), None
-    bound, shown = prior, prior > 0.0
-    while True:
-        active = np.where(shown, prior, 0.0)
-        rough = rough_calibration(signal, epochs, active) if shown.any() else np.zeros(6)
-        ready = _ready(corrected(signal, rough), epochs, sensors, gate, active)
-        if not shown.any():
-            return ready, Calibration(prior, rough, bound, shown)
-        found = final_sigma(ready.record, ready.start, gate)[6:]
-        bound = np.where(shown, found, bound)  # of what was left out it stays what it was when that was decided
-        still = shown & observed(prior, bound)
-        if np.array_equal(still, shown):
-            return ready, Calibration(prior, rough, bound, shown)
-        shown = still
+        return _ready(signal, epochs, sensors, gate), None
+    rough = rough_calibration(signal, epochs, prior)
+    ready = _ready(corrected(signal, rough), epochs, sensors, gate)
+    bound = final_sigma(ready.record, ready.start)[6:]
+    shown = observed(prior, bound)
+    if not np.array_equal(shown, prior > 0.0):
+        rough = np.where(shown, rough, 0.0)
+        rest = tuple(int(i) for i in np.flatnonzero((prior > 0.0) & ~shown))
+        ready = _ready(corrected(signal, rough), epochs, sensors, gate, rest)
+    return ready, Calibration(prior, rough, bound, shown)
 
 
-def _design(sensors: SensorsConfiguration, timeline: Timeline, calibration: np.ndarray) -> Design:
-    """Which states are estimated, as the configuration asks; `calibration` (6,) as for `_ready`."""
+def _design(sensors: SensorsConfiguration, timeline: Timeline, considered: tuple[int, ...]) -> Design:
+    """Which states are estimated, as the configuration asks; `considered` as for `_ready`."""
     rated = sensors.gyro.loss_policy == "rate_state"
     rate_sigma = 0.0
     if rated:
-        given = sensors.gyro.rate_sigma_deg_s
-        rate_sigma = _liveliness(timeline) if given is None else float(np.radians(given))
+        given, shown = sensors.gyro.rate_sigma_deg_s, _liveliness(timeline)
+        rate_sigma = shown if given is None else float(np.radians(given))
+        if rate_sigma < 0.2 * shown:
+            raise ConfigurationError(
+                f"[gyro] rate_sigma_deg_s = {given:g}: the record's rate changes by up to {np.degrees(shown):.3g} "
+                "deg/s/sqrt(s), which a random walk so small takes for bad gyro rows; give at least a fifth of that, or "
+                "leave it out"
+            )
     return Design(
         states="calibration" if sensors.calibrate.sigma.any() else "rate" if rated else "drift",
-        calibration=calibration,
+        calibration=sensors.calibrate.sigma,
+        considered=considered,
         rate_sigma=rate_sigma,
         restart=float(np.radians(sensors.filter.restart_drift_sigma_deg_h) / 3600.0)
         if sensors.filter.restart
@@ -310,18 +318,44 @@ def _misfit(epochs: Epochs) -> tuple[float, float]:
 
 
 def _start(
-    sensors: SensorsConfiguration, epochs: Epochs, levels: NoiseLevels, beginning: Beginning
-) -> tuple[Start, dict[str, str]]:
+    sensors: SensorsConfiguration, epochs: Epochs, levels: NoiseLevels, beginning: Beginning, timeline: Timeline,
+    used: np.ndarray,
+) -> tuple[Start, dict[str, str]]:  # fmt: skip
     """The belief at the first epoch, and where its "drift" and "drift_sigma" come from."""
     cov = epochs.shape[0] * levels.sigma**2
     given = sensors.gyro.initial_drift_sigma
     if given is None:
-        start = Start(epochs.q_BN[0], cov, beginning.drift, DIFFUSE * beginning.sigma)
+        rate = _first_rate(timeline, used) - beginning.drift
+        start = Start(epochs.q_BN[0], cov, beginning.drift, DIFFUSE * beginning.sigma, rate)
         return start, {"drift": FROM_ATTITUDES, "drift_sigma": FROM_ATTITUDES}
     # A drift far less known than two attitudes tell it is best linearised about what they tell.
-    vague = given > DIFFUSE * float(np.max(beginning.sigma))
+    # With a calibration they tell something else: drift and what misalignment and scale factors do together.
+    vague = given > DIFFUSE * float(np.max(beginning.sigma)) and not sensors.calibrate.sigma.any()
     start = Start(epochs.q_BN[0], cov, beginning.drift if vague else np.zeros(3), np.full(3, given))
     return start, {"drift": FROM_ATTITUDES if vague else "taken as 0", "drift_sigma": "sensors.toml"}
+
+
+def _first_rate(timeline: Timeline, used: np.ndarray) -> np.ndarray:
+    """Mean rate (3,) of the gyro between the first two epochs that are used, rad/s."""
+    epoch = timeline.epoch
+    at = np.flatnonzero((epoch >= 0) & used[np.maximum(epoch, 0)])
+    end = int(at[1]) if len(at) > 1 else len(epoch) - 1
+    dt = np.diff(timeline.time)[:end]
+    return dt @ timeline.rate[:end] / np.sum(dt)
+
+
+def _doubted(e: Estimates, updates: Updates) -> Estimates:
+    """Estimates with an honest covariance between the last attitude that was believed and a restart: there the attitude was
+    wrong by as much as the restart moved it."""
+    cov = e.cov
+    for k in np.flatnonzero(updates.status == RESET):
+        believed = np.flatnonzero(updates.status[:k] == ACCEPTED)
+        begin = int(updates.index[believed[-1]]) + 1 if len(believed) else 0
+        off = float(np.linalg.norm(np.nan_to_num(updates.residual[k])))
+        if cov is e.cov:
+            cov = e.cov.copy()
+        cov[begin : int(updates.index[k]), :3, :3] += off**2 * np.eye(3)
+    return replace(e, cov=cov)
 
 
 def _refused(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate) -> list[Problem]:
