@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -56,4 +57,41 @@ def test_the_wahba_benchmark_tells_good_from_bad(monkeypatch):
     speed = wahba.timings(["quest_two", "svd"], count=64, loops=2, jax_too=False)
     assert {"quest_two", "svd", "naive ESOQ2", "scipy align_vectors"} <= set(speed)
     for name in ("problem", "wahba"):
+        sys.modules.pop(name, None)
+
+
+def test_the_bars_of_zhou2021_are_judged(monkeypatch, capsys):
+    """One minute of two runs shows that the program runs; made-up metrics show that every bar can fail."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import zhou2021
+
+    tiny = ["--cases", "fov", "--runs", "2", "--set", "duration_s=60", "--set", "width=2", "--json"]
+    code = zhou2021.main(tiny)
+    result = json.loads(capsys.readouterr().out)
+    assert [(b["estimator"], b["what"]) for b in result["bars"]] == [
+        ("quest_ekf", "mean NEES"), ("quest_ekf", "wrong signs"), ("quest_ekf_isotropic", "mean NEES"),
+    ]  # fmt: skip
+    assert code == (0 if all(b["ok"] for b in result["bars"]) else 1)
+    assert result["ok"] is (code == 0)
+
+    def metrics(good: bool) -> dict:
+        recovery = {"median": 20.0, "converged": 2, "runs": 2} if good else {"median": None, "converged": 1, "runs": 2}
+        return {
+            "attitude_rms_deg": [1e-4 if good else 0.5] * 3, "drift_rms_deg_h": [1e-3 if good else 1.0] * 3,
+            "nees_mean": 6.0 if good else 7.0, "sign_errors": 0 if good else 1,
+            "outage_peak_deg": {"hold_mean": 1e-3, "zeros": 0.4} if good else {},
+            "recovery_s": dict.fromkeys(("start_179deg_1000deg_h", "upset_90deg"), recovery),
+        }  # fmt: skip
+
+    for case, (_, names) in zhou2021.CASES.items():
+        right = dict.fromkeys(names, metrics(True))
+        if "quest_ekf_unsigned" in right:
+            right["quest_ekf_unsigned"] = metrics(True) | {"attitude_rms_deg": [9.0] * 3}
+        if "quest_ekf_isotropic" in right:
+            right["quest_ekf_isotropic"] = metrics(True) | {"nees_mean": 20.0}
+        assert all(b.ok for b in zhou2021.bars(case, right)), case
+        assert not any(b.ok for b in zhou2021.bars(case, dict.fromkeys(names, metrics(False)))), case
+    whats = {b.what for b in zhou2021.bars("D", dict.fromkeys(zhou2021.CASES["D"][1], metrics(True)))}
+    assert {"attitude RMS, deg", "mean NEES", "gyro loss, zeros, deg", "upset_90deg, s"} <= whats
+    for name in ("problem", "zhou2021"):
         sys.modules.pop(name, None)

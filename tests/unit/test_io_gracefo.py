@@ -264,6 +264,9 @@ def test_garbage_is_a_data_error_with_its_file(tmp_path, content, message):
         ("[gracefo]\nquaternion_sens = 'bn'", r"unknown key 'gracefo\.quaternion_sens'.*quaternion_sense"),
         ("[spice]\nframe = 'MY BODY'", r"spice\.frame: 'MY BODY' is no name of a SPICE frame"),
         ("[spice]\nspacecraft_id = 5", r"spice\.spacecraft_id = 5 is not allowed"),
+        ("[spice]\nspacecraft_id = -2147484", r"spice\.spacecraft_id: -2147484 is not allowed: must be >= -2147483"),
+        ("[aem]\nref_frame_a = 'SC_BODY_1'", r"aem\.ref_frame_a: 'SC_BODY_1' must be inertial: ICRF, EME2000"),
+        ("[aem]\nref_frame_b = 'eme2000'", r"aem\.ref_frame_b: 'eme2000' is inertial, but must be the body's"),
         ("[aem]\nobject_name = ''", r"aem\.object_name: '' is no value of a message"),
     ],
 )
@@ -271,6 +274,13 @@ def test_settings_are_checked_with_their_keys(tmp_path, toml, message):
     (tmp_path / "s.toml").write_text(toml)
     with pytest.raises(ConfigurationError, match=message):
         load_sensors(tmp_path / "s.toml")
+
+
+def test_the_frames_and_numbers_that_fit_are_taken(tmp_path):
+    (tmp_path / "s.toml").write_text(
+        "[spice]\nspacecraft_id = -2147483\n[aem]\nref_frame_a = 'EME2000'\nref_frame_b = 'STAR_1'"
+    )
+    load_sensors(tmp_path / "s.toml")
 
 
 @relaxed

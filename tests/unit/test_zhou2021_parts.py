@@ -201,6 +201,72 @@ def test_an_attitude_file_is_a_profile(tmp_path):
         truth_of(long)
 
 
+def profile_file(path, **keys):
+    return load("zhou2021", {"attitude.profile": "file", "attitude.file": str(path), **keys})[1]
+
+
+def test_an_attitude_file_is_identified_by_its_content(tmp_path):
+    """Else a resume would mix runs of two truths under one name."""
+    from helmstar.campaign.store import fingerprint
+
+    def mark(spec):
+        return fingerprint({"specification": spec.model_dump(mode="json"), "estimators": [], "helmstar_version": "0"})
+
+    path = tmp_path / "p.aem"
+    path.write_text("one")
+    one = profile_file(path)
+    again = profile_file(path)
+    path.write_text("two")
+    two = profile_file(path)
+    assert mark(one) == mark(again) != mark(two)
+    assert one.attitude.file_sha256 != two.attitude.file_sha256
+    with pytest.raises(ConfigurationError, match=r"attitude: file = .*another content than file_sha256 says"):
+        load("zhou2021", one.model_dump())  # as a worker elsewhere gets it, and another file under the name
+    assert load("zhou2021", two.model_dump())[1] == two
+    with pytest.raises(ConfigurationError, match=r"attitude: file = .*none\.aem' cannot be read: No such file"):
+        profile_file(tmp_path / "none.aem")
+    assert load("zhou2021", {"attitude.file": "none.aem"})[1].attitude.file_sha256 is None  # not used, not read
+
+
+def test_a_changed_attitude_file_is_no_resume(tmp_path):
+    from helmstar.campaign.store import Store
+    from helmstar.errors import CampaignError
+
+    path = tmp_path / "p.aem"
+    manifest = {"runs": 2, "estimators": [], "helmstar_version": "0"}
+    path.write_text("one")
+    Store(tmp_path / "out", manifest | {"specification": profile_file(path).model_dump(mode="json")}, resume=False)
+    path.write_text("two")
+    with pytest.raises(CampaignError, match=r"different in attitude\.file_sha256"):
+        Store(tmp_path / "out", manifest | {"specification": profile_file(path).model_dump(mode="json")}, resume=True)
+
+
+@pytest.mark.parametrize("degrees", [89.0, 91.0])
+def test_steps_of_more_than_90_deg_are_not_interpolated(tmp_path, degrees):
+    from helmstar.io.aem import write_aem
+    from helmstar.io.clock import Origin
+
+    q = Rotation.from_rotvec(np.radians(degrees) * np.array([[0.0, 0, 0], [0, 0, 0], [0, 1, 0], [0, 1, 0]])).as_quat()
+    write_aem(tmp_path / "p.aem", Origin(8035, 37.0, absolute=True), [(np.array([0.0, 40, 70, 100]), q)])
+    if degrees < 90.0:
+        assert len(truth_of(profile_file(tmp_path / "p.aem", duration_s=100)).q) == 101
+        return
+    with pytest.raises(ConfigurationError, match=r"attitude 2 at 40 s to attitude 3 at 70 s the body turns by 91 deg"):
+        truth_of(profile_file(tmp_path / "p.aem", duration_s=100))
+
+
+def test_segments_of_an_aem_are_not_interpolated_over(tmp_path):
+    from helmstar.io.aem import write_aem
+    from helmstar.io.clock import Origin
+
+    q = np.tile([0.0, 0.0, 0.0, 1.0], (3, 1))
+    segments = [(np.array([0.0, 40, 80]) + begin, q) for begin in (0.0, 90.0, 180.0)]
+    write_aem(tmp_path / "p.aem", Origin(8035, 37.0, absolute=True), segments)
+    with pytest.raises(ConfigurationError, match=r"p\.aem: nothing is known from 80 to 90 s, between two segments"):
+        truth_of(profile_file(tmp_path / "p.aem", duration_s=100))
+    assert len(truth_of(profile_file(tmp_path / "p.aem", duration_s=80)).q) == 81  # what is used has no gap
+
+
 def test_the_timeline_has_every_pass_in_its_place():
     _, spec = load("zhou2021", {})
     t = build_timeline(spec)
@@ -237,6 +303,12 @@ def test_the_timeline_has_every_pass_in_its_place():
         ("orbit.semi_major_axis_km", 6400.0 * 0.9, ["orbit.semi_major_axis_km"]),
         ("orbit.eccentricity", 0.5, ["perigee"]),
         ("attitude.sun", [0.0, 0.0, 0.0], ["attitude.sun", "zero"]),
+        ("gyro.loss_start_s", 0, ["gyro.loss_start_s", ">= 1"]),  # hold_last would hold the lost sample
+        ("gyro.loss_start_s", 4000.5, ["gyro.loss_start_s", "integer"]),
+        ("gyro.loss_s", 60.5, ["gyro.loss_s", "integer"]),
+        ("star.loss_start_s", 0.5, ["star.loss_start_s", "integer"]),
+        ("star.loss_s", 20.5, ["star.loss_s", "integer"]),
+        ("star.loss_s", 2053, ["star.loss_start_s = 4000 and star.loss_s = 2053 end at 6053 s", "duration_s = 6052"]),
     ],
 )
 def test_wrong_keys_are_named(key, value, words):
@@ -244,6 +316,51 @@ def test_wrong_keys_are_named(key, value, words):
         load("zhou2021", {key: value})
     for word in words:
         assert word in str(e.value)
+
+
+def test_a_loss_in_the_main_pass_fits_into_it():
+    keys = {"gyro.loss_start_s": 5993, "gyro.loss_s": 60}
+    load("zhou2021", keys)  # no loss in the main pass, so nothing that has to fit
+    load("zhou2021", keys | {"gyro.loss_policy": "zeros", "duration_s": 6053})
+    with pytest.raises(
+        ConfigurationError, match=r"gyro\.loss_start_s = 5993 and gyro\.loss_s = 60 end at 6053 s.*6052"
+    ):
+        load("zhou2021", keys | {"gyro.loss_policy": "zeros"})
+    assert load("zhou2021", {"star.loss_s": 2052})[1].star.loss_s == 2052
+
+
+def test_the_limit_of_recovery_is_not_below_what_a_perfect_filter_reaches():
+    from helmstar.scenarios.specification import build
+    from helmstar.scenarios.zhou2021_results import scenario_bound
+
+    def limit(**keys):
+        experiment = build("zhou2021", load("zhou2021", {"duration_s": 1500, **keys})[1])
+        return experiment, experiment.attributes()["recovered_deg"]
+
+    assert limit()[1] == pytest.approx(0.1, rel=1e-12)
+    experiment, coarse = limit(**{"star.reading": "A"})
+    total = np.sqrt(np.mean(np.trace(scenario_bound(experiment)[-1000:, :3, :3], axis1=1, axis2=2)))
+    assert coarse == pytest.approx(5.0 * np.degrees(total), rel=1e-12)
+    assert coarse > 0.3
+    assert float(experiment.estimators["mekf"].arguments[1].recovered) == pytest.approx(np.radians(coarse), rel=1e-12)
+    # A star loss in the main pass is none in the passes in which something recovers.
+    assert limit(**{"star.reading": "A", "star.loss_start_s": 1000, "star.loss_s": 500})[1] == coarse
+
+
+def test_cells_close_to_the_claim_are_borderline():
+    from helmstar.scenarios.specification import build
+    from helmstar.scenarios.zhou2021_results import design_table
+
+    table = design_table(build("zhou2021", load("zhou2021")[1]))
+    near = [
+        min(abs(a / 0.003 - 1.0), abs(d / 0.03 - 1.0))
+        for a, d in zip(table["attitude_deg"], table["drift_deg_h"], strict=True)
+    ]
+    np.testing.assert_array_equal(table["borderline"], np.array(near) <= 0.05)
+    cells = {(str(r), float(a), float(u)) for r, a, u, b in zip(
+        table["reading"], table["arw"], table["rrw"], table["borderline"], strict=True) if b}  # fmt: skip
+    assert ("B", 0.003, 0.003) in cells
+    assert ("D", 0.01, 0.03) not in cells
 
 
 def test_heads_that_see_nothing_at_the_start_are_an_error():
@@ -484,8 +601,10 @@ def test_the_command_prints_one_object_of_the_stated_shape(capsys, tmp_path):
         "drift_rms_over_bound", "outage_peak_deg", "star_loss_deg", "recovery_s", "us_per_step",
     }  # fmt: skip
     assert set(m["outage_peak_deg"]) == {
-        "none", "zeros", "hold_last", "hold_mean", "hold_mean_raised", "commanded", "both_lost",
+        "none", "zeros", "hold_last", "hold_mean", "hold_mean_raised", "commanded", "both_lost", "rate_state",
     }  # fmt: skip
+    assert m["outage_peak_deg"]["rate_state"] is None  # mekf_rate_state did not run
+    assert "deg for good within 300 s" in (tmp_path / "report.html").read_text()
     assert m["recovery_s"]["start_179deg"]["runs"] == 2
     assert m["star_loss_deg"] == {}  # 450 s after 200 s have no room in 600 s
     assert (tmp_path / "report.html").stat().st_size > 1e6

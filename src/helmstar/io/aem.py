@@ -9,10 +9,10 @@ they stand. Numbers are written with 16 digits, the most that section 6.8.4 allo
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +24,10 @@ from .attitude_file import AttitudeSamples, attitude_part, conjugate, read_lines
 from .cleaning import Part
 from .clock import TT_MINUS_TAI_S, Instants, Origin, Scale, from_texts
 from .problems import ProblemLog
-from .settings import AemConfiguration
+from .settings import INERTIAL, AemConfiguration
 
 VERSION_KEY = "CCSDS_AEM_VERS"
 TIME_SYSTEMS: dict[str, Scale] = {"UTC": "utc", "TAI": "tai", "GPS": "gps", "TT": "tai"}
-_INERTIAL = re.compile(r"^(ICRF\d*|EME2000|J2000|GCRF\d*)$")
 _TYPES = {"QUATERNION": 4, "QUATERNION/DERIVATIVE": 8, "QUATERNION/ANGVEL": 7, "QUATERNION/RATE": 7}
 _EPOCH_DIGITS = 9
 
@@ -69,6 +68,20 @@ def read_aem(path: Path, log: ProblemLog) -> Part:
         q_BN=np.concatenate([s.q_BN for s in samples]),
     )
     return attitude_part(file, whole, "EPOCH", segments[0].meta.get("TIME_SYSTEM", "utc").lower(), log)
+
+
+def segment_gaps(path: Path) -> list[tuple[float, float]]:
+    """Begin and end, in s since the first attitude, of what lies between one segment's last attitude and the next one's
+    first: nothing is known of the attitude there."""
+    log = ProblemLog()
+    lines = read_lines(path)
+    samples = [_samples(str(path), segment, log) for segment in _segments(str(path), lines, log)]
+    times = [s.instants.select(s.timed) for s in samples if s.timed.any()]
+    if not times:
+        return []
+    zero = times[0].select(np.array([0])).earliest()
+    ends = [(t.since(zero).min(), t.since(zero).max()) for t in times]
+    return [(float(a[1]), float(b[0])) for a, b in pairwise(ends) if b[0] > a[1]]
 
 
 def _segments(file: str, lines: Sequence[str], log: ProblemLog) -> Iterator[_Segment]:
@@ -172,7 +185,7 @@ def _samples(file: str, segment: _Segment, log: ProblemLog) -> AttitudeSamples:
 def _is_from_N_to_B(where: str, meta: dict[str, str]) -> bool:
     """Whether the quaternions are from the inertial frame to the other one."""
     a, b = meta.get("REF_FRAME_A", ""), meta.get("REF_FRAME_B", "")
-    inertial_a, inertial_b = bool(_INERTIAL.match(a)), bool(_INERTIAL.match(b))
+    inertial_a, inertial_b = bool(INERTIAL.match(a)), bool(INERTIAL.match(b))
     if inertial_a == inertial_b:
         raise DataError(
             f"{where}: REF_FRAME_A = {a[:30] or 'nothing'}, REF_FRAME_B = {b[:30] or 'nothing'}; one of them has to be "

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DataError
+from .aem import is_aem, segment_gaps
+from .attitude_file import read_bytes
 from .settings import FormatSettings
 from .telemetry import read_telemetry
 
@@ -22,3 +24,9 @@ def read_attitude_profile(path: Path | str, settings: FormatSettings | None = No
     turned = np.sum(attitude.q_BN[1:] * attitude.q_BN[:-1], axis=1) < 0.0
     sign = np.where(np.cumsum(np.concatenate([[0], turned])) % 2 == 1, -1.0, 1.0)
     return attitude.time - attitude.time[0], attitude.q_BN * sign[:, None]
+
+
+def profile_gaps(path: Path | str) -> list[tuple[float, float]]:
+    """Stretches (begin, end) in s since the first attitude over which a file says not to interpolate: between the segments
+    of an AEM. Other formats know none."""
+    return segment_gaps(Path(path)) if is_aem(read_bytes(Path(path), 4096)) else []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,6 +14,11 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Axis = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 Quaternion = Annotated[list[Finite], Field(min_length=4, max_length=4)]
+
+INERTIAL = re.compile(r"^(ICRF\d*|EME2000|J2000|GCRF\d*)$")
+"""Names of inertial frames in a CCSDS message, in capitals."""
+LOWEST_SPACECRAFT_ID = -(2**31 // 1000)
+"""1000 times it, the number of the frame and of the CK's object, is still a 32-bit integer."""
 
 
 class _Settings(BaseModel):
@@ -74,7 +80,7 @@ class AemConfiguration(_Settings):
     object_name: str = "UNKNOWN"
     object_id: str = "UNKNOWN"
     originator: str = "HELMSTAR"
-    ref_frame_a: str = Field(default="ICRF", description="name of N")
+    ref_frame_a: str = Field(default="ICRF", description="name of N: ICRF, EME2000, J2000 or GCRF")
     ref_frame_b: str = Field(default="SC_BODY_1", description="name of B")
 
     @field_validator("*")
@@ -83,6 +89,20 @@ class AemConfiguration(_Settings):
         if not text.strip() or not text.isascii() or not text.isprintable() or len(text) > 200:
             raise ValueError(f"{text!r} is no value of a message: one line of printable ASCII is needed")
         return text.strip()
+
+    @field_validator("ref_frame_a")
+    @classmethod
+    def _inertial(cls, name: str) -> str:
+        if not INERTIAL.match(name.upper()):
+            raise ValueError(f"{name!r} must be inertial: ICRF, EME2000, J2000 or GCRF (the quaternion is from N to B)")
+        return name
+
+    @field_validator("ref_frame_b")
+    @classmethod
+    def _of_the_body(cls, name: str) -> str:
+        if INERTIAL.match(name.upper()):
+            raise ValueError(f"{name!r} is inertial, but must be the body's, such as SC_BODY_1")
+        return name
 
 
 class SpiceConfiguration(_Settings):
@@ -102,6 +122,15 @@ class SpiceConfiguration(_Settings):
         if not 0 < len(name) <= 26 or not name.isascii() or not name.replace("_", "").isalnum():
             raise ValueError(f"{name!r} is no name of a SPICE frame: up to 26 letters, digits and underscores")
         return name.upper()
+
+    @field_validator("spacecraft_id")
+    @classmethod
+    def _fits(cls, number: int) -> int:
+        if number < LOWEST_SPACECRAFT_ID:
+            raise ValueError(
+                f"{number} is not allowed: must be >= {LOWEST_SPACECRAFT_ID}, since 1000 times it has to be a 32-bit integer"
+            )
+        return number
 
 
 @dataclass(frozen=True)

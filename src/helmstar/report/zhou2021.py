@@ -135,13 +135,20 @@ def add_designs(page: Page, dataset: xarray.Dataset) -> None:
         a, d = r["meets_attitude"], r["meets_drift"]
         text = "met" if a and d else "attitude only" if a else "drift only" if d else "neither"
         kind = "good" if a and d else "part" if a or d else "bad"
+        if r.get("borderline"):
+            kind, text = "part", f"{text}, borderline"
         table.append(
             [
                 str(r["reading"]), r["arw"], r["rrw"], r["attitude_deg"], r["farrenkopf_deg"], r["drift_deg_h"],
                 r["farrenkopf_deg_h"], Chip(kind, text),
             ]
         )  # fmt: skip
-    page.table(columns, table, caption="One sigma against the claim, for star readings A to D and five gyros.")
+    page.table(
+        columns,
+        table,
+        caption="One sigma against the claim, for star readings A to D and five gyros. Borderline: the bound is within 5% of a "
+        "claim, so that a filter may be on the other side of it.",
+    )
 
 
 def add_figures_3_and_4(page: Page, dataset: xarray.Dataset) -> None:
@@ -259,7 +266,7 @@ def add_losses(page: Page, campaign: Campaign) -> None:
     found = {n: campaign.figures(n) for n in campaign.names}
     peaks = {n: f["outage_peak_deg"] for n, f in found.items() if f.get("outage_peak_deg")}
     if peaks:
-        used = [p for p in POLICY_TEXT if any(p in v for v in peaks.values())]
+        used = [p for p in POLICY_TEXT if any(v.get(p) is not None for v in peaks.values())]
         page.section(
             "Losses, wrong starts and upsets",
             "Each is a pass of its own that begins with the filter's state of that moment.",
@@ -293,7 +300,7 @@ def add_losses(page: Page, campaign: Campaign) -> None:
     columns = [Column("Estimator", align="left"), *(Column(_case(c), "runs, time") for c in cases)]
     page.table(
         columns, [[n, *(cell(v[c]) for c in cases)] for n, v in recovery.items()],
-        caption="Runs whose error is below the limit for good within 300 s, and how soon.",
+        caption=f"Runs whose error is below {number(campaign.attrs.get('recovered_deg'))} deg for good within 300 s, and how soon.",
     )  # fmt: skip
 
 

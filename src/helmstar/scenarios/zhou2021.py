@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,8 @@ def _number(x: Any) -> Any:
     return np.asarray(x)
 
 
+RECOVERED_BOUNDS = 5.0
+"""A run has not recovered while its error is above what a perfect filter nearly never shows: so many of its sigmas."""
 B = "left: truth (x) estimate^-1"
 VARIABLES = {
     "error_rad": Variable(
@@ -116,7 +119,24 @@ class Experiment:
             "seed": np.asarray(spec.seed),
         }
         self.simulate = Call(simulate, (Setting(**data),))
+        self.recovered = self._recovery_limit()
         self.estimators = self._estimators()
+
+    @cached_property
+    def bound(self) -> np.ndarray:
+        """Cramer-Rao covariances (n, 6, 6) of the main pass, with its star loss if it has one."""
+        from .zhou2021_results import scenario_bound
+
+        return scenario_bound(self)
+
+    def _recovery_limit(self) -> float:
+        """Error angle in rad below which a run has recovered: tuning.recovered_deg, or where a perfect filter is hardly
+        better than that RECOVERED_BOUNDS times its steady sigma, of three axes together and without losses."""
+        from .zhou2021_results import scenario_bound
+
+        bound = scenario_bound(self, losses=False) if self.timeline.dark[: self.timeline.main].any() else self.bound
+        steady = np.sqrt(np.mean(np.trace(bound[-WINDOW_S:, :3, :3], axis1=1, axis2=2)))
+        return max(np.deg2rad(self.spec.tuning.recovered_deg), RECOVERED_BOUNDS * float(steady))
 
     @property
     def coordinates(self) -> dict[str, Any]:
@@ -136,7 +156,7 @@ class Experiment:
         }
         T = self.truth
         shared = Shared(*(_number(v) for v in (T.q, T.turned, T.r_N, T.seen)), **arrays)
-        values = (round(g.hold_s), np.deg2rad(g.raised_deg_s), g.command_error, int(g.loss_start_s))
+        values = (round(g.hold_s), np.deg2rad(g.raised_deg_s), g.command_error, g.loss_start_s)
         bridging = Bridging(*(_number(v) for v in values))
         branches = tuple((b.kind, b.start, b.count) for b in tl.branches)
         rate_sigma = np.deg2rad(t.rate_sigma_deg_s)
@@ -156,7 +176,7 @@ class Experiment:
                 "fresh": (t.reset_drift_sigma_deg_h * DEG_H) ** 2 * np.eye(3),
                 "rho": t.adaptive_share,
                 "weight": np.repeat([rate_sigma**-2, 1e30], 3),
-                "recovered": np.deg2rad(t.recovered_deg),
+                "recovered": self.recovered,
             }
             arrays: dict[str, Any] = {k: np.asarray(v) for k, v in values.items()}
             return Prior(gate=gate or no_gate(), spread=kappa_form(1.0), **arrays)
@@ -194,14 +214,19 @@ class Experiment:
 
     def attributes(self) -> dict[str, Any]:
         """Of the dataset: what the report must know."""
-        return {"nees_dof": 6, "pooled_text": f"the last {WINDOW_S} s", "experiment": "zhou2021"}
+        return {
+            "nees_dof": 6,
+            "pooled_text": f"the last {WINDOW_S} s",
+            "experiment": "zhou2021",
+            "recovered_deg": float(np.degrees(self.recovered)),
+        }
 
     def fixed(self) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]]:
         """Truth, bound, and QUEST's quaternions of one example with and without (13)."""
-        from .zhou2021_results import design_table, example_quaternions, scenario_bound
+        from .zhou2021_results import design_table, example_quaternions
 
         at = self.update
-        bound = scenario_bound(self)
+        bound = self.bound
         sigma = np.sqrt(np.diagonal(bound, axis1=1, axis2=2))
         plain, continuous = example_quaternions(self)
         quaternion, axis = ("time", "quaternion"), ("time", "axis")

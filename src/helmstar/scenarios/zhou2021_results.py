@@ -21,6 +21,11 @@ GRADES = ((0.001, 0.003), (0.003, 0.003), (0.01, 0.003), (0.01, 0.03), (0.1, 0.0
 """Gyros of the table: angle random walk in deg/sqrt(h), rate random walk in deg/h/sqrt(h)."""
 OWN_POLICY = {"mekf_rate_state": "rate_state", "predictive": "no_gyro"}
 """Estimators that do without the gyro in one way of their own, whatever the policy."""
+NO_RECOVERY = ("predictive", "smoother")
+"""Estimators of which a time of recovery says nothing: one is never much better than what it recovers to, the other has no
+branches."""
+BORDERLINE = 0.05
+"""A bound so close to the claim, relative, is borderline: whether a filter of 100 runs lies below it is chance."""
 
 
 def finite(x: Any) -> float | None:
@@ -52,15 +57,14 @@ def summarise(dataset: Any) -> dict[str, dict]:
             "drift_rms_over_bound": [finite(v) for v in drift / (3600.0 * bound[3:])],
             "outage_peak_deg": _peaks(name, d),
             "star_loss_deg": _star_loss(d),
-            "recovery_s": _recoveries(d),
+            "recovery_s": _recoveries(name, d),
             "us_per_step": finite(d["us_per_step"].values),
         }
-    if "mekf_rate_state" in out:
-        # A policy that replaces the filter for the loss: what any filter with it would show.
-        peak = out["mekf_rate_state"]["outage_peak_deg"].get("rate_state")
-        for name, metrics in out.items():
-            if name not in (*OWN_POLICY, "quest_ekf_unsigned") and metrics["outage_peak_deg"]:
-                metrics["outage_peak_deg"]["rate_state"] = peak
+    # A policy that replaces the filter for the loss: what any filter with it would show. None where that filter did not run.
+    peak = out["mekf_rate_state"]["outage_peak_deg"].get("rate_state") if "mekf_rate_state" in out else None
+    for name, metrics in out.items():
+        if name not in OWN_POLICY and metrics["outage_peak_deg"]:
+            metrics["outage_peak_deg"]["rate_state"] = peak
     return out
 
 
@@ -82,10 +86,10 @@ def _star_loss(d: Any) -> dict[str, float | None]:
     return {} if None in values else dict(zip(("begin", "end", "later"), values, strict=True))
 
 
-def _recoveries(d: Any) -> dict[str, dict]:
+def _recoveries(name: str, d: Any) -> dict[str, dict]:
     """Of each case: median time until the error stays below the limit (None if half of the runs never do), how many do."""
-    if np.isnan(d["outage_peak_rad"].values).all():
-        return {}  # an estimator without branches: the smoother
+    if name in NO_RECOVERY:
+        return {}
     cases = [str(c) for c in d["case"].values]
     out = {}
     for i, case in enumerate(cases):
@@ -132,15 +136,16 @@ def bounds_of(
     return recursive_bound(F, np.broadcast_to(Q, (n, m, 6, 6)), J[1:], P0)
 
 
-def scenario_bound(experiment: Experiment) -> np.ndarray:
-    """The scenario's own bound (n, 6, 6)."""
+def scenario_bound(experiment: Experiment, losses: bool = True) -> np.ndarray:
+    """The scenario's own bound (n, 6, 6); without `losses` as if no star were lost in the main pass."""
     one = (np.array([v]) for v in (experiment.star_sigma, experiment.sigma_v, experiment.sigma_u))
-    return bounds_of(experiment, *one, dark=experiment.timeline.dark[: experiment.timeline.main])[:, 0]
+    dark = experiment.timeline.dark[: experiment.timeline.main] if losses else None
+    return bounds_of(experiment, *one, dark=dark)[:, 0]
 
 
 def design_table(experiment: Experiment, last_s: int = 1000) -> dict[str, np.ndarray]:
     """Columns over readings and gyros: bound over the last seconds and Farrenkopf's steady state (worst axis), and whether
-    the paper's 0.003 deg and 0.03 deg/h are met at one sigma."""
+    the paper's 0.003 deg and 0.03 deg/h are met at one sigma; borderline: a bound within BORDERLINE of its claim."""
     cells = [(reading, grade) for reading in READINGS for grade in GRADES]
     sigma = np.array([READINGS[reading] for reading, _ in cells])
     sigma_v = np.array([arw * DEG_SQRT_H for _, (arw, _) in cells])
@@ -162,6 +167,8 @@ def design_table(experiment: Experiment, last_s: int = 1000) -> dict[str, np.nda
         "farrenkopf_deg_h": steady.drift / DEG_H,
         "meets_attitude": attitude <= CLAIMED_DEG,
         "meets_drift": drift <= CLAIMED_DEG_H,
+        "borderline": (abs(attitude / CLAIMED_DEG - 1.0) <= BORDERLINE)
+        | (abs(drift / CLAIMED_DEG_H - 1.0) <= BORDERLINE),
     }
 
 

@@ -8,7 +8,7 @@ computed once.
 |---|---|---|
 | none | at gyro.loss_start_s, with the main pass's belief of then | nothing: what the peaks of the others compare with |
 | zeros, hold_last, ... | there | gyro lost for gyro.loss_s |
-| both_lost | there | gyro lost, bridged by hold_mean, and all stars lost as long |
+| both_lost | there | gyro lost, bridged by hold_mean, and all stars lost for gyro.loss_s too, whatever star.loss_s is |
 | star_loss | there | all stars lost for STAR_LOSS_S |
 | upset_90deg | there | the body is turned by 90 deg between two steps without the gyro's noticing |
 | start_* | at 0 s | wrong attitude, and wrong drift where a number of deg/h is given |
@@ -76,8 +76,7 @@ class Timeline:
 def build_timeline(spec: Specification) -> Timeline:
     """All passes that the scenario's duration has room for."""
     n = spec.duration_s
-    at = int(spec.gyro.loss_start_s)
-    loss = round(spec.gyro.loss_s)
+    at, loss = spec.gyro.loss_start_s, spec.gyro.loss_s
     pieces: list[tuple[str, str, dict[str, np.ndarray]]] = []
 
     def piece(start: int, count: int, **more: object) -> dict[str, np.ndarray]:
@@ -103,7 +102,7 @@ def build_timeline(spec: Specification) -> Timeline:
     )
 
     def branch(name: str, kind: str, count: int, **more: object) -> None:
-        if at < 1 or at + count > n:
+        if at + count > n:
             return
         p = piece(at, count, **more)
         p["begin"][0] = FROM_SAVED
@@ -129,6 +128,6 @@ def build_timeline(spec: Specification) -> Timeline:
         start += len(p["index"])
     whole = {k: np.concatenate([main[k], *(p[k] for _, _, p in pieces)]) for k in main}
     save = np.zeros(start, bool)
-    if 1 <= at <= n:
+    if at <= n:
         save[at - 1] = True
     return Timeline(n, tuple(branches), save=save, **whole)

@@ -4,7 +4,7 @@ Profiles, as R_BN over time:
     lvlh   the local frame H: z to the Earth, y against the orbit's normal, x forward
     yaw    z to the Earth, x in the half plane of the Sun
     slew   lvlh with a turn from rest to rest about body x, y, z in turn, each exactly once in `slew_every_s`
-    file   an attitude file, interpolated by the shortest turn
+    file   an attitude file, interpolated by the shortest turn, of LARGEST_STEP at most, and not over an AEM's segments
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ from .zhou2021_specification import Attitude, Orbit, Specification
 
 SUBSTEPS = 10
 """Of each second. The integral of the rate is summed over them; what this misses is the coning within a tenth of a second."""
+LARGEST_STEP = 0.5 * np.pi
+"""Between two attitudes of a file: from half a turn on the shortest way is not the only one, and this leaves a margin."""
 SLEW_PHASE_S = 70.0
 """Start of the first slew: at 4000 s, where the gyro is lost, one is under way."""
 
@@ -113,12 +115,26 @@ def _slews(attitude: Attitude, time: np.ndarray) -> Rotation:
 
 
 def _from_file(path: Path, time: np.ndarray) -> Rotation:
-    from ..io.profile import read_attitude_profile
+    from ..io.profile import profile_gaps, read_attitude_profile
 
     at, q = read_attitude_profile(path)
     at = at - at[0]
     if at[-1] < time[-1]:
         raise ConfigurationError(
             f"attitude.file {path}: covers {at[-1]:.6g} s, but duration_s is {time[-1]:.6g}; shorten duration_s"
+        )
+    used = np.flatnonzero(at < time[-1])
+    for begin, end in profile_gaps(path):
+        if begin < time[-1]:
+            raise ConfigurationError(
+                f"attitude.file {path}: nothing is known from {begin:.9g} to {end:.9g} s, between two segments of the message, "
+                "and over that is not interpolated; give one segment, or a duration_s that ends before"
+            )
+    turn = 2.0 * np.arccos(np.clip(np.abs(np.sum(q[used] * q[used + 1], axis=1)), 0.0, 1.0))
+    if (far := np.flatnonzero(turn > LARGEST_STEP)).size:
+        i = int(used[far[0]])
+        raise ConfigurationError(
+            f"attitude.file {path}: from attitude {i + 1} at {at[i]:.9g} s to attitude {i + 2} at {at[i + 1]:.9g} s the body turns "
+            f"by {np.degrees(turn[far[0]]):.4g} deg, and the way between is not known; give attitudes at most 90 deg apart"
         )
     return Slerp(at, Rotation.from_quat(q))(time)

@@ -2,6 +2,9 @@
 
 Pinhole with focal length f (Zhou, Li and Wu 2021, (3)): a star in direction m in the head's axes S (z is the boresight) is seen
 at p with m = [-p_x, -p_y, f] / norm; in body axes b = C_BS m.
+
+The pinhole is exact here: noise is none of the image's but is put on the directions, as in the paper's b = C_bi r + eps (5), so
+directions go through the image plane and come back as they were.
 """
 
 from __future__ import annotations
@@ -57,8 +60,8 @@ def directions_S(p: np.ndarray, focal: float) -> np.ndarray:
 
 
 def through_heads(R_BN: np.ndarray, heads: tuple[Head, ...], r_N: np.ndarray) -> np.ndarray:
-    """Directions b (n, k, 3) in B, without noise, of the stars r_N (n, k, 3) that `visible_stars` chose: through each head's
-    image plane and mounting, b = C_BS m (3), (5)."""
+    """Directions b (n, k, 3) in B of the stars r_N (n, k, 3) that `visible_stars` chose: through each head's image plane and
+    mounting, b = C_BS m (3). Without noise, which is added to them as in (5)."""
     out, i = [], 0
     for head in heads:
         R_SN = head.R_BS.T @ R_BN
