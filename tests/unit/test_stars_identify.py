@@ -162,6 +162,8 @@ def test_misuse_is_named():
         identify(xy, c, fov_range=(0.3, 0.2))
     with pytest.raises(ValueError, match="prior_q_SN"):
         track(xy, c, np.zeros(4), 0.01)
+    with pytest.raises(ValueError, match="q_SB"):
+        identify(xy, c, q_SB=np.array([0.0, 0.0, np.nan, 1.0]))
     with pytest.raises(ValueError, match="sigma_px"):
         identify(xy, c, sigma_px=np.ones(4))
 

@@ -100,6 +100,8 @@ def identify(
     """
     d, covariances = prepare(xy_px, camera, flux, magnitude, sigma_px, magnitude_sigma, zero_point)
     freedom = focal_freedom(camera, fov_range, focal_sigma)
+    if q_SB is not None:
+        q_SB = unit_quaternion("q_SB", q_SB)
     if not 0.0 < limit < 1.0:
         raise ValueError(f"limit {limit}: must be between 0 and 1")
     sky = default_sky() if sky is None else sky
@@ -298,7 +300,7 @@ def conclude(
         return unsolved("no match" if best.log_odds < 0.0 else "uncertain", done, p_false, best.log_odds)
     R, f, P, residuals = polish(sky, d, covariances[best.detections], best, freedom)
     q_SN = quaternion_of_matrix(R)
-    q_BN = q_SN if q_SB is None else quaternion_of_matrix(matrix_of_quaternion(np.asarray(q_SB, dtype=float)).T @ R)
+    q_BN = q_SN if q_SB is None else quaternion_of_matrix(matrix_of_quaternion(q_SB).T @ R)
     z = R[2]
     ra, dec = float(np.arctan2(z[1], z[0]) % (2.0 * np.pi)), float(np.arcsin(np.clip(z[2], -1.0, 1.0)))
     # The north pole seen in S: its angle from -y, positive towards -x.
@@ -343,6 +345,15 @@ def polish(sky: Sky, d: Detections, C: np.ndarray, fit: Fit, freedom: Freedom):
     freedoms = 2 * len(xy) - (4 if freedom.free else 3)
     inflation = max(1.0, chi2 / freedoms) if freedoms > 4 else 1.0
     return R, f, np.linalg.inv(information)[:3, :3] * inflation, residual
+
+
+def unit_quaternion(name: str, q: np.ndarray) -> np.ndarray:
+    """q (4,) normalised. Raises ValueError for what is no attitude."""
+    q = np.asarray(q, dtype=float)
+    norm = float(np.sqrt((q**2).sum())) if q.shape == (4,) else np.nan
+    if not 0.5 < norm < 2.0:
+        raise ValueError(f"{name} {q}: must be a unit quaternion, scalar last")
+    return q / norm
 
 
 def matrix_of_quaternion(q: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from .identify import (
     identify,
     matrix_of_quaternion,
     prepare,
+    unit_quaternion,
     unsolved,
 )
 from .patterns import LADDER, Sky
@@ -50,10 +51,9 @@ def track(
 
     Raises ValueError for a prior that is no attitude and for what `identify` refuses.
     """
-    q = np.asarray(prior_q_SN, dtype=float)
-    norm = float(np.linalg.norm(q)) if q.shape == (4,) else np.nan
-    if not 0.5 < norm < 2.0:
-        raise ValueError(f"prior_q_SN {prior_q_SN}: must be a quaternion, scalar last")
+    q = unit_quaternion("prior_q_SN", prior_q_SN)
+    if q_SB is not None:
+        q_SB = unit_quaternion("q_SB", q_SB)
     if not 0.0 < prior_sigma < np.pi:
         raise ValueError(f"prior_sigma {prior_sigma} rad: must be between 0 and pi")
     d, covariances = prepare(xy_px, camera, flux, magnitude, sigma_px, magnitude_sigma, zero_point)
@@ -66,7 +66,7 @@ def track(
     if window * sigma * 3.6 <= WIDEST_PX:
         level = levels_for(d, freedom, LADDER)[0][0]
         volume = min(SO3_VOLUME, (np.sqrt(2.0 * np.pi) * 2.0 * prior_sigma) ** 3)
-        R = matrix_of_quaternion(q / norm)
+        R = matrix_of_quaternion(q)
         fit = verify(sky, level, d, R, camera.focal_px, freedom, first_gate=window, rounds=2, volume=volume)
         if fit is not None:
             found = conclude(sky, d, covariances, freedom, [fit], 0, FEWEST, limit, q_SB)

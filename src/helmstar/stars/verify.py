@@ -282,7 +282,7 @@ class _Field:
             residual = d.xy[j] - p[i]
             sigma = scale * d.sigma[j]
             square = (residual**2).sum(axis=1) / sigma**2
-            if turn_number in (1, rounds):
+            if turn_number == rounds or (turn_number == 1 and rounds > 2):
                 gain, zero, price = magnitude_terms(d, self.V[seen], i, j)
                 gain = gain - 0.5 * square - np.log(2.0 * np.pi * sigma**2 * density)
                 # A match that speaks against the hypothesis is none: the star is missing and the detection false.
@@ -297,7 +297,7 @@ class _Field:
                     return Fit(R, f, stars, j[good], residual[good], total, scale, zero, information)
                 if total < HOPELESS:
                     return None
-            elif turn_number == 0:
+            else:
                 _, zero, _ = magnitude_terms(d, self.V[seen], i, j)
             # Far residuals of a wide gate are mostly false matches: they pull less.
             soft = sigma * np.sqrt(1.0 + square / (2.0 * widen) ** 2)
