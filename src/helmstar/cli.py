@@ -192,6 +192,7 @@ def _run(args: argparse.Namespace) -> int:
         estimators=None if args.estimators is None else args.estimators.split(","),
         resume=args.resume,
         workers=args.workers,
+        processes=True,
         batch=args.batch,
         dask=args.dask,
     )

@@ -36,7 +36,15 @@ def prepared(**overrides):
 
 
 def run(
-    folder: Path, runs: int, names=("lie", "mekf_tuned"), resume=False, workers=1, batch=None, dask=None, **overrides
+    folder: Path,
+    runs: int,
+    names=("lie", "mekf_tuned"),
+    resume=False,
+    workers=1,
+    batch=None,
+    dask=None,
+    processes=False,
+    **overrides,
 ):
     experiment, spec = prepared(**overrides)
     return run_campaign(
@@ -52,6 +60,7 @@ def run(
         workers=workers,
         batch=batch,
         dask=dask,
+        processes=processes,
         progress=False,
     )
 
@@ -93,6 +102,18 @@ def test_the_bits_do_not_depend_on_runs_workers_or_resume(eleven, tmp_path):
     assert same_bits(run(tmp_path / "c", 11, workers=2, batch=7).dataset, eleven.dataset)
     again = run(tmp_path / "a", 11, resume=True)
     assert same_bits(again.dataset, eleven.dataset)
+
+
+def test_other_processes_give_the_same_bits(eleven, tmp_path, monkeypatch):
+    from helmstar.campaign import runner
+
+    monkeypatch.setattr(runner, "HELP_PAYS_S", -1.0)
+    asked = []
+    original = runner.ProcessPoolExecutor.submit
+    monkeypatch.setattr(runner.ProcessPoolExecutor, "submit", lambda pool, *a: asked.append(a) or original(pool, *a))
+    outcome = run(tmp_path, 11, workers=2, processes=True)
+    assert asked  # else nobody helped
+    assert same_bits(outcome.dataset, eleven.dataset)
 
 
 def test_a_dask_cluster_gives_the_same_bits(eleven, tmp_path):

@@ -7,6 +7,7 @@ resume, and its bits are the same. The tail is padded with the runs that would c
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -101,11 +102,26 @@ class Engine:
         return Block(index, runs, arrays, seconds)
 
 
+_ENGINES: dict[str, Engine] = {}
+"""Of a worker's process: a scenario is built once."""
+
+
 def compute_block(name: str, specification: Mapping[str, Any], names: tuple[str, ...], index: int) -> Block:
     """One block from nothing but data: what a worker elsewhere is asked for. Programs stay in its process."""
     from ..scenarios.specification import build, specification_of, validate
 
-    spec = validate(specification_of(specification["experiment"]), specification, "campaign")
-    engine = Engine(build(name, spec), names)
-    engine.compile(1)
-    return engine.compute(index)
+    key = json.dumps([name, specification, names], sort_keys=True)
+    if key not in _ENGINES:
+        spec = validate(specification_of(specification["experiment"]), specification, "campaign")
+        engine = Engine(build(name, spec), names)
+        engine.compile(1)
+        _ENGINES.clear()
+        _ENGINES[key] = engine
+    return _ENGINES[key].compute(index)
+
+
+def compute_blocks(
+    name: str, specification: Mapping[str, Any], names: tuple[str, ...], indices: list[int]
+) -> list[Block]:
+    """Several of `compute_block`."""
+    return [compute_block(name, specification, names, index) for index in indices]

@@ -61,6 +61,11 @@ def compiled(program: Any) -> Any:
     return compile_program(jax.jit(program.call).lower(*program.in_avals))
 
 
+def has_cache() -> bool:
+    """Whether compiled programs are kept where another process finds them."""
+    return bool(jax.config.values.get("jax_compilation_cache_dir"))
+
+
 def _shape(a: Any) -> Any:
     return jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a))
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
+import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +23,8 @@ from ..files import replacing
 from ..progress import Progress
 from ..scenarios.experiment import Experiment
 from ..versions import versions
-from .engine import Block, Engine, compute_block
+from .engine import Block, Engine, compute_block, compute_blocks
+from .programs import has_cache
 from .store import Store
 
 
@@ -69,6 +73,7 @@ def run_campaign(
     batch: int | None = None,
     dask: str | None = None,
     progress: bool = True,
+    processes: bool = False,
 ) -> Outcome:
     """All runs of a campaign, in `folder`.
 
@@ -76,7 +81,8 @@ def run_campaign(
     command: what reproduces it; batch: runs that a worker takes at a time, rounded up to whole blocks; dask: address of a
     scheduler that computes the blocks instead. Raises CampaignError or ConfigurationError; on Ctrl-C the outcome holds what is
     finished, and KeyboardInterrupt is raised only when nothing is. Without `resume` an earlier campaign's blocks in `folder` are
-    discarded, which `progress` says on stderr.
+    discarded, which `progress` says on stderr. processes: other processes may help where the work is long enough (a script
+    that sets this needs the usual guard of `__main__`).
     """
     begin = time.perf_counter()
     names = choose(experiment, estimators)
@@ -107,7 +113,7 @@ def run_campaign(
                     task = bar.add(f"compiling {engine.programs} programs", engine.programs)
                     engine.compile(workers, lambda: bar.advance(task))
                     bar.finish(task)
-                interrupted = _compute(engine, store, todo, workers, batch or 1, bar, runs)
+                interrupted = _compute(engine, store, todo, workers, batch or 1, bar, runs, processes)
         except KeyboardInterrupt:
             interrupted = True
     finished = [i for i in store.finished() if i in needed]
@@ -145,8 +151,19 @@ def run_campaign(
     return Outcome(dataset, summary, interrupted)
 
 
-def _compute(engine: Engine, store: Store, todo: list[int], workers: int, batch: int, bar: Progress, runs: int) -> bool:
-    """Compute and keep the blocks; True when Ctrl-C cut it short (blocks under way are still kept)."""
+HELP_PAYS_S = 12.0
+"""A process of its own costs some seconds to start: with less work than this left there is none."""
+
+
+def _compute(
+    engine: Engine, store: Store, todo: list[int], workers: int, batch: int, bar: Progress, runs: int, processes: bool
+) -> bool:
+    """Compute and keep the blocks; True when Ctrl-C cut it short (blocks under way are still kept).
+
+    XLA's CPU runs one program at a time in a process, so threads alone leave cores idle (docs/performance.md). With
+    `processes` the first blocks tell how long the rest takes, and where that pays other processes help, with the same
+    programs from the cache, and so with the same bits.
+    """
     task = bar.add(f"{runs} runs", len(todo) * len(engine.names))
     stop = False
 
@@ -156,16 +173,57 @@ def _compute(engine: Engine, store: Store, todo: list[int], workers: int, batch:
                 return
             store.save(engine.compute(index, lambda: bar.advance(task)), engine.experiment)
 
+    def keep(blocks: list[Block] | None) -> None:
+        for block in blocks or []:  # None: computed here, and kept already
+            store.save(block, engine.experiment)
+            for _ in engine.names:
+                bar.advance(task)
+
+    def halt() -> None:
+        nonlocal stop
+        stop = True
+
     each = max(1, -(-batch // engine.experiment.width))
     queue = [todo[i : i + each] for i in range(0, len(todo), each)]
-    with ThreadPoolExecutor(workers) as pool:
+    helped = processes and workers > 1 and len(queue) > 2 and has_cache()
+    with ThreadPoolExecutor(1 if helped else workers) as own:
+        if not helped:
+            interrupted, failure = _drain(queue, lambda piece: own.submit(job, piece), workers, keep, halt)
+            return _settled(store, engine.experiment.width, failure, interrupted, bar, task)
+        begin = time.perf_counter()
+        interrupted, failure = _drain([queue.pop(0)], lambda piece: own.submit(job, piece), 1, keep, halt)
+        left = (time.perf_counter() - begin) * len(queue)
+        if not interrupted and failure is None:
+            helpers = min(workers - 1, len(queue) - 1) if left > HELP_PAYS_S else 0
+            with _helpers(helpers) as others:
+                mine: set[Future] = set()
+                spec = engine.experiment.spec.model_dump(mode="json")
 
-        def halt() -> None:
-            nonlocal stop
-            stop = True
+                def submit(piece: list[int]) -> Future:
+                    nonlocal mine
+                    mine = {f for f in mine if not f.done()}
+                    if others is None or not mine:
+                        mine.add(future := own.submit(job, piece))
+                        return future
+                    return others.submit(compute_blocks, engine.experiment.name, spec, engine.names, piece)
 
-        interrupted, failure = _drain(queue, lambda piece: pool.submit(job, piece), workers, lambda _: None, halt)
+                interrupted, failure = _drain(queue, submit, 1 + helpers, keep, halt)
     return _settled(store, engine.experiment.width, failure, interrupted, bar, task)
+
+
+@contextmanager
+def _helpers(count: int) -> Iterator[ProcessPoolExecutor | None]:
+    """Processes that leave Ctrl-C to this one; None for none."""
+    if not count:
+        yield None
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, context, initializer=_ignore_interrupts) as pool:
+        yield pool
+
+
+def _ignore_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _compute_on_dask(
