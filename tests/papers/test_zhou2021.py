@@ -4,8 +4,9 @@ All bars are exact (attitude, drift, peaks, recovery, controls) but for NEES. It
 runs of 6 states. How much the mean of 20 runs scatters follows from the filter itself (`nees_band`): the error of second k goes
 on to the next as (I - K H) F e, so the covariance of the whitened errors of any two seconds, and with it the variance of their
 mean NEES, is known. It is 9.8 a run for B and for the narrow field (poles of nearly an hour: the last 1000 s are little more
-than one sample, whose variance is 12) and 3.9 for D (the attitude forgets within 12 s, the drift in 20 minutes). So the standard deviation
-of 20 runs is 0.70 and 0.44: the bar lies 1.0 and 1.5 of them off, which a right filter would miss every third and seventh time.
+than one sample, whose variance is 12) and 3.9 for D (the attitude forgets within 12 s, the drift in 20 minutes). So the standard
+deviation of 20 runs is 0.70 and 0.44: the bar lies 1.0 and 1.5 of them off, and a right filter would miss it with every third and
+seventh seed.
 The band here takes the degrees of freedom that this variance gives, 147 and 374 instead of 120, at 1e-3 on each side. With
 about ten bands that do not depend on each other (filters that tie have nearly the same NEES), a right filter fails one of them
 with one seed in fifty; a filter with R wrong by a factor of two (NEES 3 or 12) fails them all.
