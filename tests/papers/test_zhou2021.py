@@ -9,7 +9,7 @@ deviation of 20 runs is 0.70 and 0.44: the bar lies 1.0 and 1.5 of them off, and
 seventh seed.
 The band here takes the degrees of freedom that this variance gives, 147 and 374 instead of 120, at 1e-3 on each side. With
 about ten bands that do not depend on each other (filters that tie have nearly the same NEES), a right filter fails one of them
-with one seed in fifty; a filter with R wrong by a factor of two (NEES 3 or 12) fails them all.
+with one seed in fifty; one whose covariance is off by a factor of two (NEES 3 or 12) fails them all.
 
 RMS of 20 runs scatters with the same samples: an axis' by 1 / sqrt(2 x 20 x 1.2) = 14% for B. The bars of attitude and drift are
 exact; `rms_over_bound` takes the largest of three axes and leaves 35%, 2.5 of these.
