@@ -1,7 +1,8 @@
 """The command line: parse, call, print. Everything heavy is imported by the command that needs it.
 
 With `--json` stdout is one object of finite numbers and nulls; progress and messages go to stderr, and the last line of
-stderr states an error. Exit codes: 0 done, 1 an error that the message explains, 2 wrong usage, 130 interrupted.
+stderr states an error. Exit codes: 0 done, 1 an error that the message explains, 2 wrong usage (`solve`: 1, where 2 says that
+some image is not solved), 130 interrupted.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ EPILOG = """examples:
   helmstar run xu2020 --runs 20 --estimators lie,mekf --set star.sigma_arcsec=5
   helmstar attitude gyro.csv stars.csv --config sensors.toml
   helmstar allan gyro.csv                             noise of a gyro, ready for sensors.toml
+  helmstar solve frame.png --fov 11.4                 attitude from an image of stars
 
 Every command has --help with an example. Documentation: README.md and docs/."""
 
@@ -32,9 +34,12 @@ Every command has --help with an example. Documentation: README.md and docs/."""
 class _Parser(argparse.ArgumentParser):
     """As argparse's, with an error's last line as every other error's. Subcommands' parsers are of this class too."""
 
+    misuse = 2
+    """Exit code of a wrong call."""
+
     def error(self, message: str) -> NoReturn:
         self.print_usage(sys.stderr)
-        self.exit(2, f"error: {' '.join(message.splitlines())}\n")
+        self.exit(self.misuse, f"error: {' '.join(message.splitlines())}\n")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -120,6 +125,33 @@ GRACE-FO Level-1 (SCA1A, SCA1B, IMU1A, IMU1B), CCSDS AEM, STK .a and SPICE CK fi
     )
     _common(c, "helmstar-out/attitude-FILE")
     c.set_defaults(call=_attitude)
+
+    c = sub.add_parser(
+        "solve",
+        help="attitude from images of stars, without a prior",
+        description="""Find where images of stars look: right ascension, declination, roll, attitude with sigma, matched stars.
+Images are PNG, JPEG, TIFF, BMP or FITS. A solution whose probability to be false is above --max-false is refused.
+Exit code: 0 all solved, 2 some not, 1 misuse.""",
+        epilog="""examples:
+  helmstar solve frame.png --fov 11.4
+  helmstar solve *.jpg --fov 5..25 --json
+  helmstar solve frame.fits --camera cam.toml --time 2019-07-29T20:47:26 --plot drawn""",
+        formatter_class=raw,
+    )
+    c.misuse = 1
+    c.add_argument("files", nargs="+", metavar="IMAGE", help="images of stars")
+    c.add_argument("--fov", metavar="DEG", help="horizontal full field, 11.4, or a range of it, 5..25 (default: 4..30)")
+    c.add_argument("--camera", metavar="TOML", help="calibrated camera instead of a field (docs/imaging.md)")
+    c.add_argument("--pixel-aspect", type=float, default=1.0, metavar="R", help="pixel height over width (default: 1)")
+    c.add_argument(
+        "--time", metavar="UTC", help="time of the images: moves the stars and adds aberration (default: J2000)"
+    )
+    c.add_argument(
+        "--max-false", type=float, default=1e-6, metavar="P", help="largest probability to be false (default: 1e-6)"
+    )
+    c.add_argument("--plot", metavar="DIR", help="folder for a drawing of each image")
+    c.add_argument("--json", action="store_true", help="one JSON object on stdout, progress on stderr")
+    c.set_defaults(call=_solve)
 
     c = sub.add_parser(
         "allan",
@@ -290,6 +322,27 @@ def _allan(args: argparse.Namespace) -> int:
         print(result["sensors_toml"], end="")
         print(f"report: {report.resolve()}")
     return 0
+
+
+def _solve(args: argparse.Namespace) -> int:
+    from .startracker.command import SolveOptions, print_solved, run_solve
+
+    result = run_solve(
+        [Path(f) for f in args.files],
+        SolveOptions(
+            fov=args.fov,
+            camera=None if args.camera is None else Path(args.camera),
+            aspect=args.pixel_aspect,
+            time=args.time,
+            plot=None if args.plot is None else Path(args.plot),
+            limit=args.max_false,
+        ),
+    )
+    if args.json:
+        _print_json(result)
+    else:
+        print_solved(result)
+    return 0 if all(e["status"] == "solved" for e in result["images"]) else 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:

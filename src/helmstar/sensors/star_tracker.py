@@ -1,0 +1,162 @@
+"""A star tracker: from an image to an attitude with covariance. No JAX: the first solution comes quickly.
+
+    tracker = StarTracker(camera)                        # or StarTracker(fov_deg=(5, 25)) where it is not known
+    found = tracker.solve(image)
+    found.identification.q_SN, found.ra_deg, found.status
+
+Frames: S is the camera's (z boresight, x right, y down; see imaging.camera), B the body's: v_S = R_SB v_B. Without a time the
+catalogue stands at J2000 and nothing is aberrated; with one, stars have moved to it, and directions are those that an
+observer on Earth sees.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from ..imaging import Camera, Centroids, DetectionSettings, Image, detect
+from ..stars.catalog import load_catalog
+from ..stars.identify import LIMIT, Identification, identify
+from ..stars.patterns import Sky
+from ..stars.pinhole import Pinhole
+
+FOCAL_SIGMA = 0.01
+"""1 sigma, relative, of a focal length that stands for a stated field of view."""
+CALIBRATED_SIGMA = 0.0005
+"""The same of a calibrated camera."""
+AU_DAY = 149597870700.0 / 86400.0
+LIGHT = 299792458.0
+
+
+@dataclass(frozen=True)
+class StarSolution:
+    """What became of an image. camera: with the focal length that was found; ms: milliseconds by stage; ra_deg, dec_deg: the
+    direction at the image's geometric centre, roll_deg: north's angle from image up there, counter-clockwise; NaN where it
+    is not solved. sigma_arcsec (3,): about x, y and z of S."""
+
+    identification: Identification
+    centroids: Centroids
+    camera: Camera
+    ra_deg: float
+    dec_deg: float
+    roll_deg: float
+    sigma_arcsec: np.ndarray
+    ms: dict[str, float]
+
+    @property
+    def status(self) -> str:
+        """That of the identification."""
+        return self.identification.status
+
+    @property
+    def solved(self) -> bool:
+        """Whether there is an attitude."""
+        return self.identification.solved
+
+
+class StarTracker:
+    """Camera, catalogue and limits, ready for images.
+
+    camera: calibrated; or fov_deg: the horizontal full field, a number or a range (low, high), with `aspect`, pixel height
+    over width. julian_year: of the stars' places; velocity_c (3,): the observer's barycentric velocity in N over that of
+    light, for aberration. q_SB (4,): mounting. limit: largest probability that a solution is false.
+    """
+
+    def __init__(
+        self,
+        camera: Camera | None = None,
+        *,
+        fov_deg: float | tuple[float, float] | None = None,
+        aspect: float = 1.0,
+        julian_year: float = 2000.0,
+        velocity_c: np.ndarray | None = None,
+        q_SB: np.ndarray | None = None,
+        limit: float = LIMIT,
+        detection: DetectionSettings | None = None,
+    ):
+        if (camera is None) == (fov_deg is None):
+            raise ValueError("give either a camera or a field of view")
+        self.camera, self.fov_deg, self.aspect = camera, fov_deg, aspect
+        self.q_SB, self.limit = q_SB, limit
+        self.detection = detection or DetectionSettings()
+        self.sky = _sky(julian_year, None if velocity_c is None else tuple(float(v) for v in velocity_c))
+
+    def solve(self, image: Image) -> StarSolution:
+        """Detect, identify without a prior, and solve for the attitude. Raises ValueError for an image of another size than
+        the camera's."""
+        begin = time.perf_counter()
+        centroids = detect(image, self.detection)
+        detected = time.perf_counter()
+        camera, fov_range, focal_sigma = self._optics(image.width, image.height)
+        # Identification counts pixels from their edges, images from their centres.
+        eye = Pinhole(
+            focal_px=camera.focal_px, centre_px=(camera.cx + 0.5, camera.cy + 0.5), aspect=camera.aspect,
+            distortion=camera.distortion, size_px=(camera.width, camera.height),
+        )  # fmt: skip
+        found = identify(
+            centroids.xy_px + 0.5, eye, flux=centroids.flux, sigma_px=centroids.covariance_px, fov_range=fov_range,
+            focal_sigma=focal_sigma, q_SB=self.q_SB, sky=self.sky, limit=self.limit,
+        )  # fmt: skip
+        done = time.perf_counter()
+        ms = {"detect": 1e3 * (detected - begin), "identify": 1e3 * (done - detected), "total": 1e3 * (done - begin)}
+        return _solution(found, centroids, camera, ms)
+
+    def _optics(self, width: int, height: int) -> tuple[Camera, tuple[float, float] | None, float]:
+        """Camera of an image, range of its field (rad) or None, relative sigma of its focal length."""
+        if self.camera is not None:
+            if (self.camera.width, self.camera.height) != (width, height):
+                raise ValueError(
+                    f"image of {width} x {height} pixels, but the camera has {self.camera.width} x {self.camera.height}"
+                )
+            return self.camera, None, CALIBRATED_SIGMA
+        if isinstance(self.fov_deg, tuple):
+            low, high = self.fov_deg
+            camera = Camera.from_fov(math.sqrt(low * high), width, height, self.aspect)
+            return camera, (math.radians(low), math.radians(high)), FOCAL_SIGMA
+        assert self.fov_deg is not None
+        return Camera.from_fov(self.fov_deg, width, height, self.aspect), None, FOCAL_SIGMA
+
+
+def observer(julian_date_tt: float) -> tuple[float, np.ndarray]:
+    """Julian year, and Earth's barycentric velocity (3,) in N over that of light, at a Julian date in TT (erfa's epv00)."""
+    import erfa
+
+    _, barycentric = erfa.epv00(julian_date_tt, 0.0)
+    return 2000.0 + (julian_date_tt - 2451545.0) / 365.25, np.asarray(barycentric["v"]) * AU_DAY / LIGHT
+
+
+@cache
+def _sky(year: float, velocity_c: tuple[float, ...] | None) -> Sky:
+    return Sky(load_catalog(), year, None if velocity_c is None else np.array(velocity_c))
+
+
+def _solution(found: Identification, centroids: Centroids, camera: Camera, ms: dict[str, float]) -> StarSolution:
+    nan = float("nan")
+    if not found.solved:
+        return StarSolution(found, centroids, camera, nan, nan, nan, np.full(3, nan), ms)
+    fitted = Camera(
+        camera.width, camera.height, found.focal_px, (camera.cx, camera.cy), camera.aspect, camera.distortion
+    )
+    from scipy.spatial.transform import Rotation
+
+    R = Rotation.from_quat(found.q_SN).as_matrix()
+    ra, dec, roll = centre_angles(fitted, R)
+    sigma = np.degrees(np.sqrt(np.diagonal(found.covariance))) * 3600.0
+    return StarSolution(found, centroids, fitted, ra, dec, roll, sigma, ms)
+
+
+def centre_angles(camera: Camera, R_SN: np.ndarray) -> tuple[float, float, float]:
+    """Right ascension, declination and roll in deg of the image's geometric centre: roll is north's direction there, from
+    image up (-y), counter-clockwise as seen in the image."""
+    centre = np.array(camera.geometric_centre_px)
+    z = camera.directions(centre) @ R_SN
+    # A step north on the sky, back in the image. At a pole north is everywhere; the limit along the step is taken.
+    north = np.array([0.0, 0.0, 1.0]) - z[2] * z
+    step = z + 1e-6 * north / max(float(np.linalg.norm(north)), 1e-12)
+    dx, dy = (camera.pixels(R_SN @ step) - centre) * np.array([1.0, camera.aspect])
+    roll = math.degrees(math.atan2(-dx, -dy)) % 360.0
+    return math.degrees(math.atan2(z[1], z[0])) % 360.0, math.degrees(math.asin(max(-1.0, min(1.0, z[2])))), roll

@@ -1,0 +1,1 @@
+"""Floor 4: images of stars on the command line."""

@@ -1,0 +1,175 @@
+"""`helmstar solve`: images of stars to attitudes, without a prior."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import ConfigurationError, DataError
+from ..files import readable
+from ..imaging import Camera, read_camera
+from ..progress import Progress
+from ..sensors.star_tracker import StarSolution, StarTracker, observer
+
+UNKNOWN_FIELD = (4.0, 30.0)
+"""deg: what is tried where neither camera nor field is given."""
+ARCSEC_RAD = 180.0 * 3600.0 / np.pi
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """fov: text of --fov, a number or LOW..HIGH in deg; camera: cam.toml; time: UTC, ISO 8601; plot: folder for PNGs."""
+
+    fov: str | None = None
+    camera: Path | None = None
+    aspect: float = 1.0
+    time: str | None = None
+    plot: Path | None = None
+    limit: float = 1e-6
+
+
+def field_of(text: str) -> float | tuple[float, float]:
+    """A horizontal field in deg, or a range. Raises ConfigurationError for anything else."""
+    message = f"--fov {text}: must be a field in deg such as 11.4, or a range such as 5..25, between 0.5 and 120"
+    low, dots, high = text.partition("..")
+    try:
+        values = [float(low), float(high)] if dots else [float(low)]
+    except ValueError:
+        raise ConfigurationError(message) from None
+    if not all(0.5 <= v <= 120.0 for v in values) or values != sorted(set(values)):
+        raise ConfigurationError(message)
+    return (values[0], values[1]) if dots else values[0]
+
+
+def tracker_of(options: SolveOptions) -> StarTracker:
+    """The star tracker that the options describe. Raises HelmstarError."""
+    if options.fov is not None and options.camera is not None:
+        raise ConfigurationError("--fov and --camera: give one of them, the camera has its field")
+    if not 0.1 <= options.aspect <= 10.0:
+        raise ConfigurationError(f"--pixel-aspect {options.aspect:g}: pixel height over width must be 0.1 to 10")
+    if not 1e-15 <= options.limit <= 0.5:
+        raise ConfigurationError(f"--max-false {options.limit:g}: must be between 1e-15 and 0.5")
+    camera: Camera | None = None
+    field: float | tuple[float, float] | None = None
+    if options.camera is not None:
+        if options.aspect != 1.0:
+            raise ConfigurationError("--pixel-aspect and --camera: the camera has its own aspect")
+        camera = read_camera(options.camera)
+    else:
+        field = UNKNOWN_FIELD if options.fov is None else field_of(options.fov)
+    year, velocity = (2000.0, None) if options.time is None else observer(_julian_date(options.time))
+    return StarTracker(
+        camera, fov_deg=field, aspect=options.aspect, julian_year=year, velocity_c=velocity, limit=options.limit
+    )
+
+
+def _julian_date(text: str) -> float:
+    """TT of a UTC time."""
+    import erfa
+    import pyarrow as pa
+
+    from ..io.clock import from_texts
+
+    instants, good = from_texts(pa.array([text]), "utc")
+    if not bool(np.all(good)):
+        raise ConfigurationError(f"--time {text}: must be a UTC time such as 2019-07-29T20:47:26")
+    # TAI seconds since 2000-01-01T00:00:00; TT is 32.184 s ahead.
+    return float(erfa.DJ00) - 0.5 + (float(instants.seconds()[0]) + 32.184) / 86400.0
+
+
+def run_solve(files: Sequence[Path], options: SolveOptions) -> dict[str, Any]:
+    """The object of `--json`: one entry for each file, in order, whatever became of it. Raises HelmstarError for options that
+    mean nothing."""
+    tracker = tracker_of(options)
+    entries = []
+    with Progress(len(files) > 1) as bar:
+        task = bar.add("images", len(files))
+        for file in files:
+            entries.append(_entry(tracker, file, options))
+            bar.advance(task)
+    return {"images": entries}
+
+
+def _entry(tracker: StarTracker, file: Path, options: SolveOptions) -> dict[str, Any]:
+    from ..io.images import read_image
+
+    begin = time.perf_counter()
+    try:
+        image = read_image(file)
+        read = time.perf_counter()
+        found = tracker.solve(image)
+    except (DataError, ValueError) as error:
+        return _empty(file, "unreadable" if isinstance(error, DataError) else "wrong size", str(error), begin)
+    entry = entry_of(file, found)
+    ms = {"read": 1e3 * (read - begin), **{k: v for k, v in found.ms.items() if k != "total"}}
+    entry["ms"] = {k: round(v, 3) for k, v in ms.items()}
+    entry["ms_total"] = round(1e3 * (time.perf_counter() - begin), 3)
+    if options.plot is not None:
+        from .plot import draw
+
+        entry["plot"] = readable(str(draw(image, found, options.plot / f"{file.stem}.png")))
+    return entry
+
+
+KEYS = (
+    "ra_deg", "dec_deg", "roll_deg", "q_sn", "sigma_arcsec", "fov_deg", "stars", "detections", "residual_rms_arcsec",
+    "probability_false", "hip",
+)  # fmt: skip
+
+
+def _empty(file: Path, status: str, message: str, begin: float) -> dict[str, Any]:
+    total = round(1e3 * (time.perf_counter() - begin), 3)
+    return {"file": readable(str(file)), "status": status, "message": message, **dict.fromkeys(KEYS), "ms_total": total}
+
+
+def entry_of(file: Path, found: StarSolution) -> dict[str, Any]:
+    """What is said of one image. Angles in deg at the geometric image centre; q_sn turns N into S, scalar last."""
+    i = found.identification
+    out: dict[str, Any] = {"file": readable(str(file)), "status": found.status, "message": REASON[found.status]}
+    out |= dict.fromkeys(KEYS)
+    out["detections"] = len(found.centroids)
+    p = float(i.probability_false)
+    out["probability_false"] = p if np.isfinite(p) else None
+    if not found.solved:
+        return out
+    return out | {
+        "ra_deg": found.ra_deg,
+        "dec_deg": found.dec_deg,
+        "roll_deg": found.roll_deg,
+        "q_sn": [float(v) for v in i.q_SN],
+        "sigma_arcsec": [float(v) for v in found.sigma_arcsec],
+        "fov_deg": float(np.degrees(found.camera.fov)),
+        "stars": len(i.stars),
+        "residual_rms_arcsec": float(i.residual_rms * ARCSEC_RAD),
+        "hip": [int(v) for v in i.hip],
+    }
+
+
+REASON = {
+    "solved": "",
+    "too few stars": "fewer than three stars were detected",
+    "no match": "no attitude explains the detections better than chance",
+    "uncertain": "the best attitude is more probably false than --max-false allows",
+}
+
+
+def print_solved(result: dict[str, Any]) -> None:
+    """One line for each image."""
+    for e in result["images"]:
+        if e["status"] != "solved":
+            print(f"{e['file']}: {e['status']}: {e['message']}")
+            continue
+        cross, roll = max(e["sigma_arcsec"][:2]), e["sigma_arcsec"][2]
+        print(
+            f"{e['file']}: RA {e['ra_deg']:.5f} Dec {e['dec_deg']:+.5f} roll {e['roll_deg']:.4f} deg "
+            f"(+- {cross:.2g}, roll {roll:.2g} arcsec), field {e['fov_deg']:.4f} deg, {e['stars']} stars, "
+            f"residual {e['residual_rms_arcsec']:.3g} arcsec, false {e['probability_false']:.1g}, {e['ms_total']:.0f} ms"
+        )
+
+
+__all__ = ["SolveOptions", "print_solved", "run_solve"]

@@ -1,0 +1,55 @@
+"""A solved image drawn: detections, matched stars with their names and magnitudes, residuals enlarged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..imaging import Image
+from ..sensors.star_tracker import StarSolution
+from ..stars.catalog import load_catalog
+
+SIDE = 1600
+"""Longest side of the drawing, px."""
+ENLARGED = 20.0
+"""Residuals are drawn so many times longer."""
+FOUND, MATCHED, WRONG = (250, 190, 60), (90, 220, 130), (255, 90, 90)
+
+
+def draw(image: Image, found: StarSolution, path: Path) -> Path:
+    """Write a PNG and return its path: circles for detections, green with HIP number and V for matched stars."""
+    from PIL import Image as Picture
+    from PIL import ImageDraw
+
+    scale = min(SIDE / max(image.width, image.height), 4.0)
+    size = (max(round(image.width * scale), 1), max(round(image.height * scale), 1))
+    picture = Picture.fromarray(_stretched(image.array)).resize(size).convert("RGB")
+    pen = ImageDraw.Draw(picture)
+    place = lambda xy: ((xy[0] + 0.5) * scale, (xy[1] + 0.5) * scale)  # noqa: E731
+    for xy in found.centroids.xy_px:
+        x, y = place(xy)
+        pen.ellipse((x - 7, y - 7, x + 7, y + 7), outline=FOUND)
+    i = found.identification
+    magnitude = load_catalog().magnitude
+    for k, star, hip, residual in zip(i.detections, i.stars, i.hip, i.residuals_px, strict=True):
+        x, y = place(found.centroids.xy_px[k])
+        pen.ellipse((x - 11, y - 11, x + 11, y + 11), outline=MATCHED, width=2)
+        pen.text((x + 13, y - 6), f"HIP {hip}  V {magnitude[star]:.1f}", fill=MATCHED)
+        dx, dy = residual * ENLARGED * scale
+        pen.line((x, y, x + dx, y + dy), fill=WRONG, width=2)
+    text = found.status
+    if found.solved:
+        text = f"RA {found.ra_deg:.4f}  Dec {found.dec_deg:+.4f}  roll {found.roll_deg:.3f} deg   {len(i.stars)} stars"
+    pen.text((8, 8), f"{text}   residuals x {ENLARGED:.0f}", fill=(255, 255, 255))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture.save(path)
+    return path
+
+
+def _stretched(array: np.ndarray) -> np.ndarray:
+    """8 bits, from the median to the 99.9th percentile, so that faint stars show."""
+    sample = array[:: max(array.shape[0] // 512, 1), :: max(array.shape[1] // 512, 1)]
+    low, high = np.percentile(sample, [50.0, 99.9])
+    high = max(float(high), float(low) + 1.0)
+    return (255.0 * np.clip((array - low) / (high - low), 0.0, 1.0) ** 0.5).astype(np.uint8)
