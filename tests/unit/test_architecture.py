@@ -21,7 +21,13 @@ FLOORS = {
 }  # fmt: skip
 # Rooms of one floor that may look at each other, in the direction given; report.claims is the one thing that scenarios
 # and telemetry build for the floor above them, inside the functions that make or write a report.
-BESIDE = {("filters", "models"), ("models", "filters"), ("report", "campaign"), ("sensors", "io"), ("imaging", "attitude")}
+BESIDE = {
+    ("filters", "models"),
+    ("models", "filters"),
+    ("report", "campaign"),
+    ("sensors", "io"),
+    ("imaging", "attitude"),
+}
 UPWARD = {("scenarios", "report"), ("telemetry", "report")}
 
 
