@@ -12,7 +12,7 @@ import os
 from typing import Any
 
 # One thread for each computation: small batched matrices lose more to splitting than they gain (measured: twice the CPU
-# time). Parallelism is over blocks of runs instead, one Python thread each. XLA reads NPROC when its client starts.
+# time). Parallelism is over blocks of runs instead, in other processes. XLA reads NPROC when its client starts.
 os.environ.setdefault("NPROC", "1")
 
 import jax
