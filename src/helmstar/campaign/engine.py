@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -70,11 +71,20 @@ class Engine:
             return
         simulation = self.experiment.simulate
         ids = jax.ShapeDtypeStruct((self.experiment.width,), jnp.arange(0).dtype)
-        data = jax.eval_shape(simulation.function, *simulation.arguments, ids)
+        lock, known = Lock(), []
+
+        def data() -> Any:
+            """Shapes of what the simulation gives, traced once and only if some program is not kept."""
+            with lock:
+                if not known:
+                    known.append(jax.eval_shape(simulation.function, *simulation.arguments, ids))
+                return known[0]
 
         def job(key: Any) -> tuple[Any, Any]:
             call = self._jobs[key]
-            return key, compiled(exported(call, ids if call is simulation else data))
+            if call is simulation:
+                return key, compiled(exported(call, ids))
+            return key, compiled(exported(call, data, (simulation, ids)))
 
         with ThreadPoolExecutor(workers) as pool:
             for future in as_completed([pool.submit(job, key) for key in missing]):

@@ -28,18 +28,19 @@ def signature(tree: Any) -> tuple:
     return structure, tuple((jnp.shape(a), str(jnp.result_type(a))) for a in leaves)
 
 
-def exported(call: Call, data: Any) -> Any:
+def exported(call: Call, data: Any, origin: tuple[Call, Any] | None = None) -> Any:
     """The call as `jax.export.Exported`, on the leaves of (arguments, data) and giving the leaves of its result.
 
-    `data` is a tree of arrays or shapes.
+    `data` is a tree of arrays or shapes; with an origin, a call and its data that it is the result of, a function that gives
+    the tree: what is kept is then found without asking it, which spares tracing the origin.
     """
-    path = _stored(call, data)
+    path = _stored(call, data) if origin is None else _stored(call, origin[1], origin[0])
     if path is not None and path.exists():
         try:
             return jax.export.deserialize(bytearray(path.read_bytes()))
         except Exception:  # a damaged or foreign file, whatever the reader says of it: made anew below
             path.unlink(missing_ok=True)
-    leaves, structure = jax.tree.flatten((call.arguments, data))
+    leaves, structure = jax.tree.flatten((call.arguments, data if origin is None else data()))
 
     def flat(*leaves: Any) -> tuple:
         arguments, data = jax.tree.unflatten(structure, leaves)
@@ -70,14 +71,15 @@ def _shape(a: Any) -> Any:
     return jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a))
 
 
-def _stored(call: Call, data: Any) -> Path | None:
-    """Where the exported call is kept; None without a compilation cache, or for a call that is not helmstar's alone."""
+def _stored(call: Call, data: Any, origin: Call | None = None) -> Path | None:
+    """Where the exported call is kept; None without a compilation cache, or for a call that is not helmstar's alone. With an
+    origin the call is on what that call makes of `data`."""
     folder = jax.config.values.get("jax_compilation_cache_dir")
     if not folder:
         return None
-    tree = (call.arguments, data)
+    tree = (call.arguments, data) if origin is None else (call.arguments, (origin.arguments, data))
     try:
-        what = [_described(v) for v in (call.function, dict(call.static))]
+        what = [_described(v) for c in (call, origin) if c for v in (c.function, dict(c.static))]
         structure = _structure(jax.tree.structure(tree))
     except _NotOurs:
         return None
