@@ -24,7 +24,7 @@ from ..stars.identify import LIMIT, Identification, identify
 from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
 
-FOCAL_SIGMA = 0.01
+FOCAL_SIGMA = 0.005
 """1 sigma, relative, of a focal length that stands for a stated field of view."""
 CALIBRATED_SIGMA = 0.0005
 """The same of a calibrated camera."""
