@@ -140,7 +140,9 @@ Exit code: 0 all solved, 2 some not, 1 misuse.""",
     )
     c.misuse = 1
     c.add_argument("files", nargs="+", metavar="IMAGE", help="images of stars")
-    c.add_argument("--fov", metavar="DEG", help="horizontal full field, 11.4, or a range of it, 5..25 (default: 4..30)")
+    c.add_argument(
+        "--fov", metavar="DEG", help="horizontal full field, within 1%%, 11.4, or a range, 5..25 (default: 4..30)"
+    )
     c.add_argument("--camera", metavar="TOML", help="calibrated camera instead of a field (docs/imaging.md)")
     c.add_argument("--pixel-aspect", type=float, default=1.0, metavar="R", help="pixel height over width (default: 1)")
     c.add_argument(
