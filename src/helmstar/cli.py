@@ -151,6 +151,10 @@ Exit code: 0 all solved, 2 some not, 1 misuse.""",
     c.add_argument(
         "--max-false", type=float, default=1e-6, metavar="P", help="largest probability to be false (default: 1e-6)"
     )
+    c.add_argument(
+        "--catalog", choices=("hipparcos", "gaia"), default="hipparcos",
+        help='stars: Hipparcos to V 9, or Gaia to G 10 for narrow fields (pip install "helmstar[gaia]")',
+    )  # fmt: skip
     c.add_argument("--plot", metavar="DIR", help="folder for a drawing of each image")
     c.add_argument("--json", action="store_true", help="one JSON object on stdout, progress on stderr")
     c.set_defaults(call=_solve)
@@ -338,6 +342,7 @@ def _solve(args: argparse.Namespace) -> int:
             time=args.time,
             plot=None if args.plot is None else Path(args.plot),
             limit=args.max_false,
+            catalog=args.catalog,
         ),
     )
     if args.json:

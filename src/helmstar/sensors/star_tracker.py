@@ -19,10 +19,11 @@ from functools import cache
 import numpy as np
 
 from ..imaging import Camera, Centroids, DetectionSettings, Image, detect
-from ..stars.catalog import load_catalog
+from ..stars.catalog import Catalog, load_catalog
 from ..stars.identify import LIMIT, Identification, identify
 from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
+from ..stars.track import track
 
 FOCAL_SIGMA = 0.005
 """1 sigma, relative, of a focal length that stands for a stated field of view."""
@@ -63,7 +64,8 @@ class StarTracker:
 
     camera: calibrated; or fov_deg: the horizontal full field, a number or a range (low, high), with `aspect`, pixel height
     over width. julian_year: of the stars' places; velocity_c (3,): the observer's barycentric velocity in N over that of
-    light, for aberration. q_SB (4,): mounting. limit: largest probability that a solution is false.
+    light, for aberration; position_au (3,): its barycentric position in N, for parallax. q_SB (4,): mounting. limit: largest
+    probability that a solution is false. catalog: other stars than Hipparcos's.
     """
 
     def __init__(
@@ -74,6 +76,8 @@ class StarTracker:
         aspect: float = 1.0,
         julian_year: float = 2000.0,
         velocity_c: np.ndarray | None = None,
+        position_au: np.ndarray | None = None,
+        catalog: Catalog | None = None,
         q_SB: np.ndarray | None = None,
         limit: float = LIMIT,
         detection: DetectionSettings | None = None,
@@ -83,11 +87,19 @@ class StarTracker:
         self.camera, self.fov_deg, self.aspect = camera, fov_deg, aspect
         self.q_SB, self.limit = q_SB, limit
         self.detection = detection or DetectionSettings()
-        self.sky = _sky(julian_year, None if velocity_c is None else tuple(float(v) for v in velocity_c))
+        if catalog is None:
+            self.sky = _sky(julian_year, _plain(velocity_c), _plain(position_au))
+        else:
+            self.sky = Sky(catalog, julian_year, velocity_c, position_au)
 
-    def solve(self, image: Image) -> StarSolution:
-        """Detect, identify without a prior, and solve for the attitude. Raises ValueError for an image of another size than
-        the camera's."""
+    def solve(
+        self, image: Image, *, prior_q_SN: np.ndarray | None = None, prior_sigma: float | None = None
+    ) -> StarSolution:
+        """Detect, identify and solve for the attitude: without a prior, or tracking from prior_q_SN (4,), good to prior_sigma
+        (rad, per axis), with the whole sky as what remains where that fails. The solution does not contain the prior.
+
+        Raises ValueError for an image of another size than the camera's, and for a prior that means nothing.
+        """
         begin = time.perf_counter()
         centroids = detect(image, self.detection)
         detected = time.perf_counter()
@@ -97,10 +109,16 @@ class StarTracker:
             focal_px=camera.focal_px, centre_px=(camera.cx + 0.5, camera.cy + 0.5), aspect=camera.aspect,
             distortion=camera.distortion, size_px=(camera.width, camera.height),
         )  # fmt: skip
-        found = identify(
-            centroids.xy_px + 0.5, eye, flux=centroids.flux, sigma_px=centroids.covariance_px, fov_range=fov_range,
-            focal_sigma=focal_sigma, q_SB=self.q_SB, sky=self.sky, limit=self.limit,
-        )  # fmt: skip
+        if prior_q_SN is not None and prior_sigma is not None and fov_range is None:
+            found = track(
+                centroids.xy_px + 0.5, eye, prior_q_SN, prior_sigma, flux=centroids.flux,
+                sigma_px=centroids.covariance_px, focal_sigma=focal_sigma, q_SB=self.q_SB, sky=self.sky, limit=self.limit,
+            )  # fmt: skip
+        else:
+            found = identify(
+                centroids.xy_px + 0.5, eye, flux=centroids.flux, sigma_px=centroids.covariance_px, fov_range=fov_range,
+                focal_sigma=focal_sigma, q_SB=self.q_SB, sky=self.sky, limit=self.limit,
+            )  # fmt: skip
         done = time.perf_counter()
         ms = {"detect": 1e3 * (detected - begin), "identify": 1e3 * (done - detected), "total": 1e3 * (done - begin)}
         return _solution(found, centroids, camera, ms)
@@ -129,9 +147,21 @@ def observer(julian_date_tt: float) -> tuple[float, np.ndarray]:
     return 2000.0 + (julian_date_tt - 2451545.0) / 365.25, np.asarray(barycentric["v"]) * AU_DAY / LIGHT
 
 
+def observer_place(julian_date_tt: float) -> np.ndarray:
+    """Earth's barycentric position (3,) in N, astronomical units, at a Julian date in TT (erfa's epv00)."""
+    import erfa
+
+    return np.asarray(erfa.epv00(julian_date_tt, 0.0)[1]["p"])
+
+
+def _plain(vector: np.ndarray | None) -> tuple[float, ...] | None:
+    return None if vector is None else tuple(float(v) for v in vector)
+
+
 @cache
-def _sky(year: float, velocity_c: tuple[float, ...] | None) -> Sky:
-    return Sky(load_catalog(), year, None if velocity_c is None else np.array(velocity_c))
+def _sky(year: float, velocity_c: tuple[float, ...] | None, position_au: tuple[float, ...] | None) -> Sky:
+    velocity, position = (None if v is None else np.array(v) for v in (velocity_c, position_au))
+    return Sky(load_catalog(), year, velocity, position)
 
 
 def _solution(found: Identification, centroids: Centroids, camera: Camera, ms: dict[str, float]) -> StarSolution:

@@ -220,12 +220,19 @@ class Sky:
     """The catalogue as one camera sees it: directions at a year and for an observer's velocity, and the tables.
 
     year: Julian year of the directions used for verification and attitude. velocity_c: (3,) barycentric velocity of the
-    observer in N over the speed of light, for aberration; None for none.
+    observer in N over the speed of light, for aberration; position_au: (3,) its barycentric position, for parallax; None for
+    none.
     """
 
-    def __init__(self, catalog: Catalog, year: float = 2000.0, velocity_c: np.ndarray | None = None):
+    def __init__(
+        self,
+        catalog: Catalog,
+        year: float = 2000.0,
+        velocity_c: np.ndarray | None = None,
+        position_au: np.ndarray | None = None,
+    ):
         self.catalog = catalog
-        self.directions = aberrated(catalog.directions(year), velocity_c)
+        self.directions = aberrated(catalog.directions(year, position_au), velocity_c)
         self.magnitude = catalog.magnitude
         self._shared = _shared_tables(catalog)
         self._deep: dict[int, tuple[np.ndarray, np.ndarray]] = {}

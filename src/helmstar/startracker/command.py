@@ -14,16 +14,19 @@ from ..errors import ConfigurationError, DataError
 from ..files import readable
 from ..imaging import Camera, read_camera
 from ..progress import Progress
-from ..sensors.star_tracker import StarSolution, StarTracker, observer
+from ..sensors.star_tracker import StarSolution, StarTracker, observer, observer_place
+from ..stars.catalog import Catalog, load_gaia
 
 UNKNOWN_FIELD = (4.0, 30.0)
 """deg: what is tried where neither camera nor field is given."""
+CATALOGS = ("hipparcos", "gaia")
 ARCSEC_RAD = 180.0 * 3600.0 / np.pi
 
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """fov: text of --fov, a number or LOW..HIGH in deg; camera: cam.toml; time: UTC, ISO 8601; plot: folder for PNGs."""
+    """fov: text of --fov, a number or LOW..HIGH in deg; camera: cam.toml; time: UTC, ISO 8601; plot: folder for PNGs;
+    catalog: of CATALOGS."""
 
     fov: str | None = None
     camera: Path | None = None
@@ -31,6 +34,7 @@ class SolveOptions:
     time: str | None = None
     plot: Path | None = None
     limit: float = 1e-6
+    catalog: str = "hipparcos"
 
 
 def field_of(text: str) -> float | tuple[float, float]:
@@ -62,10 +66,21 @@ def tracker_of(options: SolveOptions) -> StarTracker:
         camera = read_camera(options.camera)
     else:
         field = UNKNOWN_FIELD if options.fov is None else field_of(options.fov)
-    year, velocity = (2000.0, None) if options.time is None else observer(_julian_date(options.time))
+    year, velocity, position = 2000.0, None, None
+    if options.time is not None:
+        date = _julian_date(options.time)
+        (year, velocity), position = observer(date), observer_place(date)
     return StarTracker(
-        camera, fov_deg=field, aspect=options.aspect, julian_year=year, velocity_c=velocity, limit=options.limit
-    )
+        camera, fov_deg=field, aspect=options.aspect, julian_year=year, velocity_c=velocity, position_au=position,
+        catalog=_catalog(options.catalog), limit=options.limit,
+    )  # fmt: skip
+
+
+def _catalog(name: str) -> Catalog | None:
+    """None is Hipparcos, whose tables are kept ready."""
+    if name not in CATALOGS:
+        raise ConfigurationError(f"--catalog {name}: must be one of {', '.join(CATALOGS)}")
+    return load_gaia() if name == "gaia" else None
 
 
 def _julian_date(text: str) -> float:
