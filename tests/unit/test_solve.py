@@ -15,6 +15,7 @@ from helmstar.cli import main
 from helmstar.imaging import Camera
 from helmstar.imaging.render import render
 from helmstar.sensors.star_tracker import centre_angles, observer
+from helmstar.startracker.command import SolveOptions, tracker_of
 from helmstar.stars import load_catalog
 
 CAMERA = Camera.from_fov(12.0, 800, 600)
@@ -122,6 +123,15 @@ def test_the_observer_moves_with_the_earth():
     assert np.linalg.norm(velocity) * 299792.458 == pytest.approx(30.3, abs=0.3)  # km/s, near perihelion
     _, half = observer(2451545.0 + 182.6)
     assert velocity @ half < -0.99 * np.linalg.norm(velocity) * np.linalg.norm(half)
+
+
+def test_a_stated_time_moves_the_stars():
+    """61 Cygni goes 5.28 arcsec a year; aberration turns all stars by up to 20.5 arcsec on top."""
+    catalog = load_catalog()
+    k = int(np.flatnonzero(catalog.hip == 104214)[0])
+    sky = tracker_of(SolveOptions(fov="10", time="2019-07-29T20:47:26")).sky
+    moved = np.degrees(np.linalg.norm(sky.directions[k] - catalog.directions(2000.0)[k])) * 3600.0
+    assert moved == pytest.approx(19.575 * 5.28, abs=22.0)
 
 
 @pytest.mark.shared_data

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import ConfigurationError, DataError
 from ..files import readable
-from ..imaging import Camera, read_camera
+from ..imaging.calibrated import Calibrated, read_calibrated
 from ..progress import Progress
 from ..sensors.star_tracker import StarSolution, StarTracker, observer, observer_place
 from ..stars.catalog import Catalog, load_gaia
@@ -58,15 +58,15 @@ def tracker_of(options: SolveOptions) -> StarTracker:
         raise ConfigurationError(f"--pixel-aspect {options.aspect:g}: pixel height over width must be 0.1 to 10")
     if not 1e-15 <= options.limit <= 0.5:
         raise ConfigurationError(f"--max-false {options.limit:g}: must be between 1e-15 and 0.5")
-    camera: Camera | None = None
+    camera: Calibrated | None = None
     field: float | tuple[float, float] | None = None
     if options.camera is not None:
         if options.aspect != 1.0:
             raise ConfigurationError("--pixel-aspect and --camera: the camera has its own aspect")
-        camera = read_camera(options.camera)
+        camera = read_calibrated(options.camera)
     else:
         field = UNKNOWN_FIELD if options.fov is None else field_of(options.fov)
-    year, velocity, position = 2000.0, None, None
+    year, velocity, position = None, None, None
     if options.time is not None:
         date = _julian_date(options.time)
         (year, velocity), position = observer(date), observer_place(date)
@@ -93,8 +93,8 @@ def _julian_date(text: str) -> float:
     instants, good = from_texts(pa.array([text]), "utc")
     if not bool(np.all(good)):
         raise ConfigurationError(f"--time {text}: must be a UTC time such as 2019-07-29T20:47:26")
-    # TAI seconds since 2000-01-01T00:00:00; TT is 32.184 s ahead.
-    return float(erfa.DJ00) - 0.5 + (float(instants.seconds()[0]) + 32.184) / 86400.0
+    # TAI days and seconds since 2000-01-01T00:00:00; TT is 32.184 s ahead.
+    return float(erfa.DJ00) - 0.5 + float(instants.day[0]) + (float(instants.second[0]) + 32.184) / 86400.0
 
 
 def run_solve(files: Sequence[Path], options: SolveOptions) -> dict[str, Any]:
