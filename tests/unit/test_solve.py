@@ -15,8 +15,8 @@ from helmstar.cli import main
 from helmstar.imaging import Camera
 from helmstar.imaging.render import render
 from helmstar.sensors.star_tracker import centre_angles, observer
-from helmstar.startracker.command import SolveOptions, tracker_of
 from helmstar.stars import load_catalog
+from helmstar.startracker.command import SolveOptions, tracker_of
 
 CAMERA = Camera.from_fov(12.0, 800, 600)
 
