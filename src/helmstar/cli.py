@@ -27,6 +27,7 @@ EPILOG = """examples:
   helmstar attitude gyro.csv stars.csv --config sensors.toml
   helmstar allan gyro.csv                             noise of a gyro, ready for sensors.toml
   helmstar solve frame.png --fov 11.4                 attitude from an image of stars
+  helmstar render --ra 83.8 --dec -5.4 --fov 12       such an image, with its truth
 
 Every command has --help with an example. Documentation: README.md and docs/."""
 
@@ -158,6 +159,47 @@ Exit code: 0 all solved, 2 some not, 1 misuse.""",
     c.add_argument("--plot", metavar="DIR", help="folder for a drawing of each image")
     c.add_argument("--json", action="store_true", help="one JSON object on stdout, progress on stderr")
     c.set_defaults(call=_solve)
+
+    c = sub.add_parser(
+        "render",
+        help="a star tracker's frame of the sky, or a sequence, with its truth",
+        description="""Render what a star tracker would see: stars of the catalogue with point spread, smear, Poisson and read
+noise, dark current, hot pixels, glow. --ra, --dec, --roll are of the image's centre at mid-exposure, as `helmstar solve` says them.""",
+        epilog="""examples:
+  helmstar render --ra 83.8 --dec -5.4 --roll 30 --fov 12 --out orion.png --truth orion.json
+  helmstar render --ra 10 --dec 41 --camera cam.toml --bits 16 --format fits --time 2024-03-01T20:00:00
+  helmstar render --ra 10 --dec 41 --fov 10 --rate-deg-s 0,0.05,0 --count 30 --step 1 --out night
+  helmstar attitude night --fov 10""",
+        formatter_class=raw,
+    )
+    c.add_argument("--ra", type=float, required=True, metavar="DEG", help="right ascension of the image's centre")
+    c.add_argument("--dec", type=float, required=True, metavar="DEG", help="its declination")
+    c.add_argument("--roll", type=float, default=0.0, metavar="DEG", help="north from image up, counter-clockwise")
+    c.add_argument("--camera", metavar="TOML", help="camera (docs/imaging.md)")
+    c.add_argument("--fov", type=float, metavar="DEG", help="horizontal full field of a camera without distortion")
+    c.add_argument("--size", metavar="WxH", help="its pixels (default: 1024x768)")
+    c.add_argument("--time", metavar="UTC", help="of the (first) frame: moves the stars, adds aberration and parallax")
+    c.add_argument("--exposure", type=float, default=0.2, metavar="S", help="exposure time (default: 0.2 s)")
+    c.add_argument("--psf", type=float, default=0.8, metavar="PX", help="sigma of the point spread (default: 0.8)")
+    c.add_argument(
+        "--sky", type=float, default=20.0, metavar="E", help="sky, electrons a pixel and second (default: 20)"
+    )
+    c.add_argument(
+        "--glow", action="append", default=[], metavar="X,Y,PEAK,SIGMA", help="stray light; px and electrons"
+    )
+    c.add_argument("--rate-deg-s", default="0,0,0", metavar="X,Y,Z", help="rate of the camera, in its axes")
+    c.add_argument("--hot-pixels", type=int, default=0, metavar="N", help="pixels with much dark current")
+    c.add_argument("--limit-magnitude", type=float, metavar="V", help="faintest star (default: the catalogue's)")
+    c.add_argument("--catalog", choices=("hipparcos", "gaia"), default="hipparcos", help="V to 9, or G to 10")
+    c.add_argument("--seed", type=int, default=0, metavar="S", help="of the noise; frame k of a sequence has S + k")
+    c.add_argument("--bits", type=int, choices=(8, 16), default=8, help="of a pixel (default: 8)")
+    c.add_argument("--format", choices=("png", "fits", "tiff"), help="default: what --out ends in, or png")
+    c.add_argument("--count", type=int, metavar="N", help="a sequence of N frames in the folder --out, with frames.csv")
+    c.add_argument("--step", type=float, default=1.0, metavar="S", help="time between its frames (default: 1 s)")
+    c.add_argument("--truth", metavar="JSON", help="file for the truth (of a sequence: truth.json in its folder)")
+    c.add_argument("--out", metavar="PATH", help="file, or folder of a sequence (default: frame.png)")
+    c.add_argument("--json", action="store_true", help="one JSON object on stdout, progress on stderr")
+    c.set_defaults(call=_render)
 
     c = sub.add_parser(
         "allan",
@@ -350,6 +392,26 @@ def _solve(args: argparse.Namespace) -> int:
     else:
         print_solved(result)
     return 0 if all(e["status"] == "solved" for e in result["images"]) else 2
+
+
+def _render(args: argparse.Namespace) -> int:
+    from .startracker.render_command import RenderOptions, print_rendered, run_render
+
+    path = lambda text: None if text is None else Path(text)  # noqa: E731
+    result = run_render(
+        RenderOptions(
+            args.ra, args.dec, args.roll, fov_deg=args.fov, size=args.size, camera=path(args.camera), time=args.time,
+            exposure_s=args.exposure, psf_sigma_px=args.psf, sky_e_s=args.sky, glow=tuple(args.glow),
+            rate_deg_s=args.rate_deg_s, hot_pixels=args.hot_pixels, limit_magnitude=args.limit_magnitude,
+            catalog=args.catalog, seed=args.seed, bits=args.bits, format=args.format, count=args.count,
+            step_s=args.step, out=path(args.out), truth=path(args.truth),
+        )
+    )  # fmt: skip
+    if args.json:
+        _print_json(result)
+    else:
+        print_rendered(result)
+    return 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:

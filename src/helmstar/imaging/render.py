@@ -116,6 +116,39 @@ def render(
     return image, Truth(seen[on], place[seen][on, 0], place[seen][on, 1], electrons[on])
 
 
+def pointed(camera: Camera, ra: float, dec: float, roll: float) -> np.ndarray:
+    """Attitude q_SN (4,) with which the image's geometric centre looks at right ascension and declination (rad, ICRS) and north
+    there is seen at `roll` (rad) from image up (-y), counter-clockwise; the inverse of sensors.star_tracker.centre_angles.
+
+    At a pole north is the way along the meridian of `ra`. Raises ValueError for angles that are not finite.
+    """
+    from scipy.spatial.transform import Rotation
+
+    if not all(map(math.isfinite, (ra, dec, roll))):
+        raise ValueError(f"ra {ra}, dec {dec}, roll {roll}: must be finite angles")
+    centre = np.array(camera.geometric_centre_px)
+    z_S = camera.directions(centre)
+    step = camera.directions(centre + 1e-3 * np.array([-math.sin(roll), -math.cos(roll) / camera.aspect])) - z_S
+    north_S = step - (step @ z_S) * z_S
+    north_S /= np.linalg.norm(north_S)
+    sa, ca, sd, cd = math.sin(ra), math.cos(ra), math.sin(dec), math.cos(dec)
+    z_N, north_N = np.array([ca * cd, sa * cd, sd]), np.array([-ca * sd, -sa * sd, cd])
+    in_S, in_N = (np.stack([a, b, np.cross(a, b)], axis=1) for a, b in ((z_S, north_S), (z_N, north_N)))
+    return Rotation.from_matrix(in_S @ in_N.T).as_quat()
+
+
+def turned(q_SN: np.ndarray, omega_SN_S: np.ndarray, time: float) -> np.ndarray:
+    """Attitude (4,) after a time (s) of a constant rate (3,) rad/s, in S: R(t) = exp(-[omega t x]) R(0)."""
+    from scipy.spatial.transform import Rotation
+
+    return (Rotation.from_rotvec(-time * np.asarray(omega_SN_S, float)) * Rotation.from_quat(q_SN)).as_quat()
+
+
+def longest_smear(camera: Camera, exposure: Exposure) -> float:
+    """Bound of the length of a star's path over the exposure, px."""
+    return 2.0 * _travel(camera, exposure)
+
+
 def _travel(camera: Camera, e: Exposure) -> float:
     """Bound of half a star's path, px, over the exposure."""
     corner = math.hypot(camera.width, camera.height / min(camera.aspect, 1.0)) / 2
@@ -184,4 +217,4 @@ def _sensor(light: np.ndarray, e: Exposure, rng: np.random.Generator) -> Image:
     return Image(counts.astype(kind), saturation, e.bits, {"format": "rendered"})
 
 
-__all__ = ["Exposure", "Glow", "Truth", "render"]
+__all__ = ["Exposure", "Glow", "Truth", "longest_smear", "pointed", "render", "turned"]
