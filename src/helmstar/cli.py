@@ -163,8 +163,9 @@ Exit code: 0 all solved, 2 some not, 1 misuse.""",
     c = sub.add_parser(
         "render",
         help="a star tracker's frame of the sky, or a sequence, with its truth",
-        description="""Render what a star tracker would see: stars of the catalogue with point spread, smear, Poisson and read
-noise, dark current, hot pixels, glow. --ra, --dec, --roll are of the image's centre at mid-exposure, as `helmstar solve` says them.""",
+        description="""Render what a star tracker would see: stars of the catalogue with point spread, smear, Poisson and
+read noise, dark current, hot pixels, glow. --ra, --dec, --roll are of the image's centre at mid-exposure, as
+`helmstar solve` says them.""",
         epilog="""examples:
   helmstar render --ra 83.8 --dec -5.4 --roll 30 --fov 12 --out orion.png --truth orion.json
   helmstar render --ra 10 --dec 41 --camera cam.toml --bits 16 --format fits --time 2024-03-01T20:00:00

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,8 +22,9 @@ def write_image(
     """Write a grey image.
 
     array: (height, width), uint8 or uint16. form: "png", "tiff" or "fits". begun, taken: UTC of the exposure's begin and
-    middle, ISO 8601 with six digits of a second; FITS gets them as DATE-OBS and DATE-AVG, the others the middle as EXIF's DateTimeOriginal,
-    which says nothing of which it is. header: more cards for FITS. Raises OSError, and ValueError for other arrays and formats.
+    middle, ISO 8601 with six digits of a second; FITS gets them as DATE-OBS and DATE-AVG, the others the middle as EXIF's
+    DateTimeOriginal, which says nothing of which it is. header: more cards for FITS. Raises OSError, and ValueError for
+    other arrays and formats.
     """
     if array.ndim != 2 or array.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"array {array.shape} of {array.dtype}: must be (height, width) of uint8 or uint16")
@@ -38,18 +40,22 @@ def write_image(
 
 def _pillow(path: Path, array: np.ndarray, form: str, taken: str | None, exposure_s: float | None) -> None:
     from PIL import Image as Picture
+    from PIL import TiffImagePlugin
 
-    more = {}
+    more: dict[str, Any] = {}
     if taken is not None:
-        exif = Picture.Exif()
-        own = exif.get_ifd(_EXIF)
         whole, _, fraction = taken.partition(".")
-        own[_ORIGINAL] = whole.replace("-", ":").replace("T", " ")
-        own[_SUBSECOND] = fraction or "0"
-        own[_OFFSET] = "+00:00"
+        own: dict[int, Any] = {
+            _ORIGINAL: whole.replace("-", ":").replace("T", " "), _SUBSECOND: fraction or "0", _OFFSET: "+00:00",
+        }  # fmt: skip
         if exposure_s is not None:
             own[_EXPOSURE] = exposure_s
-        more["exif"] = exif
+        if form == "tiff":  # whose writer takes no Exif object's inner directory
+            more["tiffinfo"] = TiffImagePlugin.ImageFileDirectory_v2()
+            more["tiffinfo"][_EXIF] = own
+        else:
+            more["exif"] = Picture.Exif()
+            more["exif"][_EXIF] = own
     Picture.fromarray(array).save(path, format=form.upper(), **more)
 
 

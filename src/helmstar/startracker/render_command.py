@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -202,7 +203,9 @@ class _Clock:
         self._origin = origin
 
     def utc(self, seconds: float) -> str:
-        return self._origin.utc([seconds])[0]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that leap seconds of the years to come are not known
+            return self._origin.utc([seconds])[0]
 
     def tt(self, seconds: float) -> float:
         return 2451544.5 + self._origin.day + (self._origin.second + seconds + 32.184) / 86400.0
