@@ -67,8 +67,7 @@ class Camera:
         object.__setattr__(self, "aspect", float(self.aspect))
         object.__setattr__(self, "centre_px", centre)
         object.__setattr__(self, "distortion", distortion)
-        corners = self._plane(self._corners())
-        if any(distortion) and not np.isfinite(corners).all():
+        if any(distortion) and self._folds():
             raise ValueError(f"distortion {distortion}: folds the image over before its corners; check k1, k2, k3")
 
     @classmethod
@@ -141,11 +140,25 @@ class Camera:
     def _reach(self) -> float:
         """The radius sqrt(x^2 + y^2) up to which the radial distortion grows; infinite for most lenses."""
         k1, k2, _, _, k3 = self.distortion
+        if not (k2 or k3):
+            return math.sqrt((1 - _FOLD) / (-3 * k1)) if k1 < -1e-9 else math.inf
         slope = np.array([7 * k3, 5 * k2, 3 * k1, 1 - _FOLD])
         slope[np.abs(slope) < 1e-9] = 0.0  # such a fold lies beyond 88 deg, and tiny leading terms spoil the roots
         roots = np.roots(slope)
         real = roots.real[(np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots))) & (roots.real > 0)]
         return float(np.sqrt(real.min())) if real.size else math.inf
+
+    def _folds(self) -> bool:
+        """Whether a corner lies beyond what the distortion reaches."""
+        k1, k2, p1, p2, k3 = self.distortion
+        corners = self._corners()
+        if p1 or p2:
+            return not bool(np.isfinite(self._plane(corners)).all())
+        r = self._reach
+        if math.isinf(r):
+            return False
+        x, y = (corners[:, 0] - self.cx) / self.focal_px, (corners[:, 1] - self.cy) * (self.aspect / self.focal_px)
+        return bool(np.hypot(x, y).max() > r * (1 + r**2 * (k1 + r**2 * (k2 + r**2 * k3))))
 
     def _corners(self) -> np.ndarray:
         x, y = np.array([-0.5, self.width - 0.5]), np.array([-0.5, self.height - 0.5])

@@ -13,17 +13,19 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
 from ..imaging import Camera, Centroids, DetectionSettings, Image, detect
+from ..imaging.calibrated import Calibrated
 from ..stars.catalog import Catalog, load_catalog
-from ..stars.identify import LIMIT, Identification, identify
+from ..stars.identify import LIMIT, Identification, identify, matrix_of_quaternion
 from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
 from ..stars.track import track
+from .refine import EPOCH_SPREAD_YEARS, LensPrior, refine
 
 FOCAL_SIGMA = 0.005
 """1 sigma, relative, of a focal length that stands for a stated field of view."""
@@ -35,9 +37,10 @@ LIGHT = 299792458.0
 
 @dataclass(frozen=True)
 class StarSolution:
-    """What became of an image. camera: with the focal length that was found; ms: milliseconds by stage; ra_deg, dec_deg: the
-    direction at the image's geometric centre, roll_deg: north's angle from image up there, counter-clockwise; NaN where it
-    is not solved. sigma_arcsec (3,): about x, y and z of S."""
+    """What became of an image. camera: with the focal length and k1 that were found; ms: milliseconds by stage; ra_deg, dec_deg:
+    the direction at the image's geometric centre, roll_deg: north's angle from image up there, counter-clockwise; NaN
+    where it is not solved. sigma_arcsec (3,): about x, y and z of S. scale: factor on the centroids' sigmas that the residuals
+    show and that the covariance holds."""
 
     identification: Identification
     centroids: Centroids
@@ -47,6 +50,7 @@ class StarSolution:
     roll_deg: float
     sigma_arcsec: np.ndarray
     ms: dict[str, float]
+    scale: float = 1.0
 
     @property
     def status(self) -> str:
@@ -62,19 +66,21 @@ class StarSolution:
 class StarTracker:
     """Camera, catalogue and limits, ready for images.
 
-    camera: calibrated; or fov_deg: the horizontal full field, a number or a range (low, high), with `aspect`, pixel height
-    over width. julian_year: of the stars' places; velocity_c (3,): the observer's barycentric velocity in N over that of
-    light, for aberration; position_au (3,): its barycentric position in N, for parallax. q_SB (4,): mounting. limit: largest
-    probability that a solution is false. catalog: other stars than Hipparcos's.
+    camera: a Camera, or Calibrated with what its calibration says; or fov_deg: the horizontal full field, a number or a range
+    (low, high), with `aspect`, pixel height over width. julian_year: of the stars' places; None is 2000 for images of an
+    unknown time, whose stars have moved: their proper motion then counts as uncertainty. velocity_c (3,): the
+    observer's barycentric velocity in N over that of light, for aberration; position_au (3,): its barycentric position in
+    N, for parallax. q_SB (4,): mounting. limit: largest probability that a solution is false. catalog: other stars than
+    Hipparcos's.
     """
 
     def __init__(
         self,
-        camera: Camera | None = None,
+        camera: Camera | Calibrated | None = None,
         *,
         fov_deg: float | tuple[float, float] | None = None,
         aspect: float = 1.0,
-        julian_year: float = 2000.0,
+        julian_year: float | None = None,
         velocity_c: np.ndarray | None = None,
         position_au: np.ndarray | None = None,
         catalog: Catalog | None = None,
@@ -84,7 +90,11 @@ class StarTracker:
     ):
         if (camera is None) == (fov_deg is None):
             raise ValueError("give either a camera or a field of view")
-        self.camera, self.fov_deg, self.aspect = camera, fov_deg, aspect
+        self.known = Calibrated(camera) if isinstance(camera, Camera) else camera
+        self.camera = None if self.known is None else self.known.camera
+        self.fov_deg, self.aspect = fov_deg, aspect
+        self.epoch_years = EPOCH_SPREAD_YEARS if julian_year is None else 0.0
+        julian_year = 2000.0 if julian_year is None else julian_year
         self.q_SB, self.limit = q_SB, limit
         self.detection = detection or DetectionSettings()
         if catalog is None:
@@ -101,9 +111,19 @@ class StarTracker:
         Raises ValueError for an image of another size than the camera's, and for a prior that means nothing.
         """
         begin = time.perf_counter()
-        centroids = detect(image, self.detection)
+        centroids = detect(image, self.detection, None if self.known is None else self.known.dark)
         detected = time.perf_counter()
-        camera, fov_range, focal_sigma = self._optics(image.width, image.height)
+        ms = {"detect": 1e3 * (detected - begin)}
+        return self.identified(centroids, image.width, image.height, prior_q_SN, prior_sigma, ms)
+
+    def identified(
+        self, centroids: Centroids, width: int, height: int, prior_q_SN: np.ndarray | None = None,
+        prior_sigma: float | None = None, ms: dict[str, float] | None = None,
+    ) -> StarSolution:  # fmt: skip
+        """As `solve`, from the stars that were detected. ms: milliseconds of what went before."""
+        begin = time.perf_counter()
+        centroids = self._honest(centroids)
+        camera, fov_range, focal_sigma = self._optics(width, height)
         # Identification counts pixels from their edges, images from their centres.
         eye = Pinhole(
             focal_px=camera.focal_px, centre_px=(camera.cx + 0.5, camera.cy + 0.5), aspect=camera.aspect,
@@ -120,8 +140,26 @@ class StarTracker:
                 focal_sigma=focal_sigma, q_SB=self.q_SB, sky=self.sky, limit=self.limit,
             )  # fmt: skip
         done = time.perf_counter()
-        ms = {"detect": 1e3 * (detected - begin), "identify": 1e3 * (done - detected), "total": 1e3 * (done - begin)}
-        return _solution(found, centroids, camera, ms)
+        scale = 1.0
+        if found.solved:
+            if self.known is not None:
+                prior = LensPrior.calibrated(self.known)
+            else:
+                prior = LensPrior.uncalibrated(camera, math.inf if fov_range is not None else focal_sigma)
+            refined = refine(found, centroids, camera, self.sky, prior, self.epoch_years)
+            found, camera, scale = refined.identification, refined.camera, refined.scale
+        end = time.perf_counter()
+        ms = {**(ms or {}), "identify": 1e3 * (done - begin), "refine": 1e3 * (end - done)}
+        ms["total"] = sum(ms.values())
+        return _solution(found, centroids, camera, ms, scale)
+
+    def _honest(self, centroids: Centroids) -> Centroids:
+        """With the covariances that the calibration found."""
+        known = self.known
+        if known is None or (known.centroid_scale == 1.0 and known.centroid_floor_px == 0.0):
+            return centroids
+        C = known.centroid_scale**2 * centroids.covariance_px + known.centroid_floor_px**2 * np.eye(2)
+        return replace(centroids, covariance_px=C)
 
     def _optics(self, width: int, height: int) -> tuple[Camera, tuple[float, float] | None, float]:
         """Camera of an image, range of its field (rad) or None, relative sigma of its focal length."""
@@ -164,19 +202,15 @@ def _sky(year: float, velocity_c: tuple[float, ...] | None, position_au: tuple[f
     return Sky(load_catalog(), year, velocity, position)
 
 
-def _solution(found: Identification, centroids: Centroids, camera: Camera, ms: dict[str, float]) -> StarSolution:
+def _solution(
+    found: Identification, centroids: Centroids, camera: Camera, ms: dict[str, float], scale: float
+) -> StarSolution:
     nan = float("nan")
     if not found.solved:
         return StarSolution(found, centroids, camera, nan, nan, nan, np.full(3, nan), ms)
-    fitted = Camera(
-        camera.width, camera.height, found.focal_px, (camera.cx, camera.cy), camera.aspect, camera.distortion
-    )
-    from scipy.spatial.transform import Rotation
-
-    R = Rotation.from_quat(found.q_SN).as_matrix()
-    ra, dec, roll = centre_angles(fitted, R)
+    ra, dec, roll = centre_angles(camera, matrix_of_quaternion(found.q_SN))
     sigma = np.degrees(np.sqrt(np.diagonal(found.covariance))) * 3600.0
-    return StarSolution(found, centroids, fitted, ra, dec, roll, sigma, ms)
+    return StarSolution(found, centroids, camera, ra, dec, roll, sigma, ms, scale)
 
 
 def centre_angles(camera: Camera, R_SN: np.ndarray) -> tuple[float, float, float]:

@@ -50,8 +50,8 @@ def field_of(text: str) -> float | tuple[float, float]:
     return (values[0], values[1]) if dots else values[0]
 
 
-def tracker_of(options: SolveOptions) -> StarTracker:
-    """The star tracker that the options describe. Raises HelmstarError."""
+def tracker_of(options: SolveOptions, date_tt: float | None = None) -> StarTracker:
+    """The star tracker that the options describe, at their time or else at a Julian date in TT. Raises HelmstarError."""
     if options.fov is not None and options.camera is not None:
         raise ConfigurationError("--fov and --camera: give one of them, the camera has its field")
     if not 0.1 <= options.aspect <= 10.0:
@@ -67,8 +67,8 @@ def tracker_of(options: SolveOptions) -> StarTracker:
     else:
         field = UNKNOWN_FIELD if options.fov is None else field_of(options.fov)
     year, velocity, position = None, None, None
-    if options.time is not None:
-        date = _julian_date(options.time)
+    date = date_tt if options.time is None else _julian_date(options.time)
+    if date is not None:
         (year, velocity), position = observer(date), observer_place(date)
     return StarTracker(
         camera, fov_deg=field, aspect=options.aspect, julian_year=year, velocity_c=velocity, position_au=position,

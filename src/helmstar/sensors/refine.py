@@ -1,0 +1,284 @@
+"""The last fit of a star tracker: attitude with the lens, within what is known of the lens, on all stars that can be matched.
+
+A camera that nobody calibrated has a field of view, and no more: where its boresight meets the sensor and how its lens bends
+straight lines are unknown to some percent. An attitude fitted as if they were known is off by more than its covariance says. Here
+they are parameters with priors (`LensPrior`): what the stars show of them is corrected, what they do not show widens
+the covariance. A calibrated camera has the same parameters with the sigmas of its calibration.
+
+The attitude belongs to the frame S whose z axis is seen at the camera's stated centre (the geometric one without calibration). A
+principal point elsewhere, at an offset e, then shows only by the perspective's second order; to the first order in e and with
+x, y = X/Z, Y/Z of S, D the distortion and a the aspect,
+
+    (x, y)' = (x, y) - (e_x (1 + x^2) + a e_y x y, a e_y (1 + y^2) + e_x x y)/f,   u = c + e + f diag(1, 1/a) D((x, y)').
+
+Huber's loss keeps wrong matches and double stars from pulling. The scale of the residuals is fitted from them, together with what
+is believed before (`SCALE_DEGREES`): a frame of few stars cannot say that its sigmas are wrong, one of many can. A
+catalogue place of unknown epoch is uncertain by its proper motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..attitude import quaternion_of_matrix
+from ..imaging import Camera, Centroids
+from ..imaging.calibrated import Calibrated
+from ..stars.identify import Identification, matrix_of_quaternion
+from ..stars.patterns import Sky
+from ..stars.verify import turn
+
+EPOCH_SPREAD_YEARS = 25.0
+"""Proper motion counts as this many years of uncertainty where the time of an image is not told."""
+SCALE_DEGREES = 8.0
+"""Degrees of freedom that the belief in the centroids' sigmas is worth against the residuals."""
+HUBER = 2.5
+"""Residuals (of two coordinates, over sigma) beyond which a star pulls no more."""
+GATE = 4.0
+"""Residuals of matches over sigma, what the fit does not know yet included."""
+MAGNITUDE_GATE = 2.5
+"""Difference of magnitudes beyond which a star and a detection do not match."""
+STILL_PX = 0.03
+"""Steps that move no star farther are the last: what the linear problem leaves is of their second order."""
+_STEPS = 4
+_LEAST = 3
+_ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class LensPrior:
+    """1 sigma of what the lens may differ from the camera: focal (relative; infinite: unknown), centre_px, and k1."""
+
+    focal: float
+    centre_px: float
+    k1: float
+
+    @classmethod
+    def uncalibrated(cls, camera: Camera, focal: float) -> LensPrior:
+        """Of an unknown lens: centred within 2% of the image's width, and 1% of distortion in the corner."""
+        corner = 0.5 * float(np.hypot(camera.width, camera.height * camera.aspect)) / camera.focal_px
+        return cls(focal, 0.02 * camera.width, 0.01 / corner**2)
+
+    @classmethod
+    def calibrated(cls, known: Calibrated) -> LensPrior:
+        """As the calibration says; a camera written by hand is believed to 0.05% of its focal length, 0.2% of its width, and 0.1%
+        of distortion in the corner. A focal length follows the temperature: never better than 0.01%."""
+        camera = known.camera
+        corner = 0.5 * float(np.hypot(camera.width, camera.height * camera.aspect)) / camera.focal_px
+        focal = 5e-4 if known.focal_sigma_px is None else float(np.hypot(known.focal_sigma_px / camera.focal_px, 1e-4))
+        centre = 0.002 * camera.width if known.centre_sigma_px is None else known.centre_sigma_px
+        return cls(focal, centre, 0.001 / corner**2 if known.k1_sigma is None else known.k1_sigma)
+
+
+@dataclass(frozen=True)
+class Refined:
+    """identification: with the attitude, covariance, matches and residuals of the fit. camera: with the fit's focal length and
+    k1. scale: factor on the sigmas of the matched stars that their residuals show; the covariance holds it."""
+
+    identification: Identification
+    camera: Camera
+    scale: float
+
+
+def refine(
+    found: Identification, centroids: Centroids, camera: Camera, sky: Sky, prior: LensPrior, epoch_years: float = 0.0
+) -> Refined:
+    """Fit attitude and lens to all stars that match, from a solved identification.
+
+    camera: as the identification took it. epoch_years: 1 sigma of the time between the sky's year and the image. Where fewer
+    than three stars match, the identification stays as it is.
+    """
+    start = replace(camera, focal_px=found.focal_px)
+    lens = _Lens.of(camera, prior)
+    R, p = matrix_of_quaternion(found.q_SN), np.array([np.log(found.focal_px / camera.focal_px), 0.0, 0.0, 0.0])
+    near = _in_view(sky, R[2], start)
+    at = np.minimum(np.searchsorted(near, found.stars), len(near) - 1)
+    good = near[at] == found.stars if len(near) else np.zeros(len(at), bool)
+    i, j = at[good], found.detections[good]
+    if len(i) < _LEAST:
+        return Refined(found, start, 1.0)
+    xy, C = centroids.xy_px, centroids.covariance_px
+    drift = epoch_years * found.focal_px * np.hypot(sky.catalog.pm_ra[near], sky.catalog.pm_dec[near])
+    spread = lambda i, j: C[j] + drift[i, None, None] ** 2 * lens.round  # noqa: E731
+    magnitude = -2.5 * np.log10(np.maximum(centroids.flux, 1e-12))
+    zero = np.median(sky.magnitude[found.stars] - magnitude[found.detections])
+    agree = np.abs(sky.magnitude[near][:, None] - magnitude - zero) < MAGNITUDE_GATE
+    d_N, best, residual = sky.directions[near], None, np.zeros((0, 2))
+    for _ in range(_STEPS):
+        predicted, J = lens.predict(R, p, d_N)
+        best = None if best is None else replace(best, delta=np.zeros(7))
+        best = _settle(J[i], xy[j] - predicted[i], spread(i, j), lens.prior(p), 2 if best is None else 1, best)
+        k, m = _matched(predicted + best.moved(J), J, best, xy, C, drift, agree)
+        same = len(k) == len(i) and bool((k == i).all() and (m == j).all())
+        if not same and len(k) >= max(_LEAST, len(i) // 2):
+            i, j = k, m
+            best = _settle(J[i], xy[j] - predicted[i], spread(i, j), lens.prior(p), 2, best)
+        R, p = turn(best.delta[:3], R), p + best.delta[3:]
+        moved = best.moved(J[i])
+        residual = xy[j] - predicted[i] - moved
+        if float(np.abs(moved).max()) < STILL_PX:
+            break
+    assert best is not None
+    order = np.argsort(j, kind="stable")
+    i, j, residual = i[order], j[order], residual[order]
+    focal = camera.focal_px * float(np.exp(p[0]))
+    try:
+        fitted = replace(
+            camera, focal_px=focal, distortion=(camera.distortion[0] + float(p[3]), *camera.distortion[1:])
+        )
+    except ValueError:  # a distortion that folds the corners over, where no star was seen
+        fitted = replace(camera, focal_px=focal)
+    q_SN, z = quaternion_of_matrix(R), R[2]
+    mounted = found.q_BN is not found.q_SN
+    R_BS = matrix_of_quaternion(found.q_BN) @ matrix_of_quaternion(found.q_SN).T if mounted else None
+    better = replace(
+        found, q_SN=q_SN, q_BN=q_SN if R_BS is None else quaternion_of_matrix(R_BS @ R),
+        covariance=best.covariance[:3, :3], stars=near[i], detections=j, hip=sky.catalog.hip[near[i]],
+        residuals_px=residual * [1.0, camera.aspect], focal_px=focal,
+        residual_rms=float(np.sqrt(np.mean((residual * [1.0, camera.aspect]) ** 2)) / focal),
+        ra=float(np.arctan2(z[1], z[0]) % (2.0 * np.pi)), dec=float(np.arcsin(np.clip(z[2], -1.0, 1.0))),
+        roll=float(np.arctan2(-R[0, 2], -R[1, 2]) % (2.0 * np.pi)),
+    )  # fmt: skip
+    return Refined(better, fitted, best.scale)
+
+
+def _in_view(sky: Sky, boresight: np.ndarray, camera: Camera) -> np.ndarray:
+    """Indices of the stars within a tenth more than the camera's half diagonal of a direction (3,)."""
+    radius = 0.55 * float(np.hypot(camera.width, camera.height * camera.aspect)) / camera.focal_px
+    return np.flatnonzero(sky.directions @ boresight > np.cos(np.arctan(radius)))
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """The camera, the information (7,) of the priors on theta (none), ln f, e_x, e_y, k1, and round (2, 2): a round
+    uncertainty of the sky in the image's pixels."""
+
+    camera: Camera
+    known: np.ndarray
+    round: np.ndarray
+
+    @classmethod
+    def of(cls, camera: Camera, prior: LensPrior) -> _Lens:
+        sigma = np.array([prior.focal, prior.centre_px, prior.centre_px / camera.aspect, prior.k1])
+        known = np.concatenate([np.zeros(3), 1.0 / np.maximum(sigma, 1e-9) ** 2])
+        return cls(camera, known, np.diag([1.0, camera.aspect**-2]))
+
+    def predict(self, R: np.ndarray, p: np.ndarray, d_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels (n, 2) of directions, and their derivative (n, 2, 7) by theta, ln f, e_x, e_y, k1."""
+        c = self.camera
+        a, f, (ex, ey) = c.aspect, c.focal_px * np.exp(p[0]), p[1:3]
+        k1, k2, p1, p2, k3 = c.distortion
+        k1 = k1 + p[3]
+        # Where the lens itself sees the stated centre: a turn takes z of S there.
+        sx, sy = -ex / f, -a * ey / f
+        r2 = sx * sx + sy * sy
+        sx, sy = sx / (1.0 + k1 * r2), sy / (1.0 + k1 * r2)
+        T = _turn_to(sx, sy)
+        v = d_N @ (T @ R).T
+        x, y = v[:, 0] / v[:, 2], v[:, 1] / v[:, 2]
+        xy = x * y
+        xx, yy = 1.0 + x * x, 1.0 + y * y
+        turn_x, turn_y = (-xy, xx, -y), (-yy, xy, x)
+        shift_x, shift_y = -sx * xx - sy * xy, -sy * yy - sx * xy
+        r2 = x * x + y * y
+        g = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        h = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+        xd = x * g + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        yd = y * g + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+        cross = h * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+        dxx = g + h * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        dyy = g + h * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        J = np.empty((len(x), 2, 7))
+        for k in range(3):
+            J[:, 0, k] = f * (dxx * turn_x[k] + cross * turn_y[k])
+            J[:, 1, k] = f / a * (cross * turn_x[k] + dyy * turn_y[k])
+        J[:, 0, 3] = f * (xd + dxx * shift_x + cross * shift_y)
+        J[:, 1, 3] = f / a * (yd + cross * shift_x + dyy * shift_y)
+        J[:, :, 4] = [1.0, 0.0] - J[:, :, 1] / f
+        J[:, :, 5] = [0.0, 1.0] + a * J[:, :, 0] / f
+        J[:, :, :3] = (J[:, :, :3].reshape(-1, 3) @ T).reshape(-1, 2, 3)
+        J[:, 0, 6], J[:, 1, 6] = f * x * r2, f / a * y * r2
+        return np.stack([c.cx + ex + f * xd, c.cy + ey + f / a * yd], axis=1), J
+
+    def prior(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Information (7,) of what is known before, and its gradient (7,) at p."""
+        return self.known, -self.known * np.concatenate([np.zeros(3), p])
+
+
+def _turn_to(x: float, y: float) -> np.ndarray:
+    """The least turn (3, 3) that takes z to the direction of [x, y, 1]."""
+    length = np.sqrt(x * x + y * y + 1.0)
+    a, b, c = x / length, y / length, 1.0 / length
+    k = 1.0 / (1.0 + c)
+    return np.array([[1.0 - k * a * a, -k * a * b, a], [-k * a * b, 1.0 - k * b * b, b], [-a, -b, c]])
+
+
+@dataclass(frozen=True)
+class _Settled:
+    """Step (7,) of the parameters, their covariance (7, 7), and the scale of the residuals."""
+
+    delta: np.ndarray
+    covariance: np.ndarray
+    scale: float
+
+    def moved(self, J: np.ndarray) -> np.ndarray:
+        """By how much pixels of that derivative (n, 2, 7) move, (n, 2)."""
+        return (J.reshape(-1, 7) @ self.delta).reshape(-1, 2)
+
+
+def _settle(
+    J: np.ndarray, residual: np.ndarray, covariance: np.ndarray, prior: tuple[np.ndarray, np.ndarray], rounds: int,
+    start: _Settled | None = None,
+) -> _Settled:  # fmt: skip
+    """The linear problem J delta = residual (n, 2) with Huber's weights and the scale, `rounds` times, from what is
+    settled already."""
+    known, pull = prior
+    det = covariance[:, 0, 0] * covariance[:, 1, 1] - covariance[:, 0, 1] ** 2
+    W = covariance[:, ::-1, ::-1] * _ADJUGATE / det[:, None, None]
+    A = J.reshape(-1, 7)
+    # Inverted in units in which the information is about one: priors span many orders.
+    size = 1.0 / np.sqrt((A * A).sum(axis=0) + known)
+    WJ = W[:, :, :1] * J[:, None, 0] + W[:, :, 1:] * J[:, None, 1]
+    k, target = np.arange(7), residual.ravel()
+    if start is None:
+        start = _Settled(np.zeros(7), np.diag(np.where(known > 0.0, 1.0 / np.maximum(known, 1e-300), 0.0)), 1.0)
+    delta, P, scale = start.delta, start.covariance, start.scale
+    units, tiny = size * size[:, None], 1e-13 * np.eye(7)
+    for _ in range(rounds):
+        rx, ry = (target - A @ delta).reshape(-1, 2).T
+        square = np.maximum(W[:, 0, 0] * rx * rx + 2.0 * W[:, 0, 1] * rx * ry + W[:, 1, 1] * ry * ry, 1e-12)
+        weight = np.minimum(1.0, HUBER * scale / np.sqrt(square))
+        seen = 7.0 - float(P[k, k] @ known)  # parameters that the stars fix, not the priors
+        free = max(2.0 * float(weight.sum()) - seen, 0.0)
+        scale = float(np.sqrt((SCALE_DEGREES + weight @ square) / (SCALE_DEGREES + free)))
+        weighted = (WJ * (weight / scale**2)[:, None, None]).reshape(-1, 7)
+        N = A.T @ weighted
+        N[k, k] += known
+        P = np.linalg.inv(N * units + tiny) * units
+        delta = P @ (weighted.T @ target + pull)
+    return _Settled(delta, P, scale)
+
+
+def _matched(
+    predicted: np.ndarray,
+    J: np.ndarray,
+    fit: _Settled,
+    xy: np.ndarray,
+    C: np.ndarray,
+    drift: np.ndarray,
+    agree: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stars and detections (k,), (k,) that are each other's nearest within the gate and agree (stars, detections)."""
+    A = J.reshape(-1, 7)
+    sigma2 = fit.scale**2 * 0.5 * (C[:, 0, 0] + C[:, 1, 1])
+    doubt2 = 0.5 * ((A @ fit.covariance) * A).sum(axis=1).reshape(-1, 2).sum(axis=1) + drift**2
+    apart = (predicted[:, :1] - xy[:, 0]) ** 2 + (predicted[:, 1:] - xy[:, 1]) ** 2
+    apart[~agree | (apart > GATE**2 * (sigma2 + doubt2[:, None]))] = np.inf
+    j = apart.argmin(axis=1)
+    rows = np.arange(len(apart))
+    good = np.isfinite(apart[rows, j]) & (apart.argmin(axis=0)[j] == rows)
+    return rows[good], j[good]
+
+
+__all__ = ["EPOCH_SPREAD_YEARS", "LensPrior", "Refined", "refine"]
