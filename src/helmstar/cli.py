@@ -27,6 +27,7 @@ EPILOG = """examples:
   helmstar attitude gyro.csv stars.csv --config sensors.toml
   helmstar allan gyro.csv                             noise of a gyro, ready for sensors.toml
   helmstar solve frame.png --fov 11.4                 attitude from an image of stars
+  helmstar calibrate night/*.png --fov 11.4           camera from images of stars
   helmstar render --ra 83.8 --dec -5.4 --fov 12       such an image, with its truth
 
 Every command has --help with an example. Documentation: README.md and docs/."""
@@ -101,16 +102,27 @@ def parser() -> argparse.ArgumentParser:
         description="""Filter and smooth attitude and gyro drift (6 states) from CSV or Parquet telemetry.
 Native columns: time_s; gyro_x_rad_s, gyro_y_rad_s, gyro_z_rad_s; q_bn_x, q_bn_y, q_bn_z, q_bn_w (scalar last, N to B).
 They may stand in one table or in two; other layouts are mapped by [columns] in the configuration (docs/telemetry.md).
-GRACE-FO Level-1 (SCA1A, SCA1B, IMU1A, IMU1B), CCSDS AEM, STK .a and SPICE CK files are read as they are.""",
+GRACE-FO Level-1 (SCA1A, SCA1B, IMU1A, IMU1B), CCSDS AEM, STK .a and SPICE CK files are read as they are. A folder of star
+images with times (frames.csv, or dates in the images) stands for attitudes, with gyro data beside it or without.""",
         epilog="""examples:
   helmstar attitude telemetry.csv
   helmstar attitude SCA1B_2022-01-01_C_04.txt IMU1B_2022-01-01_C_04.txt
   helmstar attitude gyro.csv attitude.aem --aem --ck --out flight
   helmstar attitude gyro.csv startracker.parquet --config sensors.toml --out flight
-  helmstar attitude gyro.csv stars.csv --config sensors.toml --json > summary.json""",
+  helmstar attitude gyro.csv stars.csv --config sensors.toml --json > summary.json
+  helmstar attitude night --fov 11.4                  a folder of star images, no gyro
+  helmstar attitude night gyro.csv --camera cam.toml --config sensors.toml""",
         formatter_class=raw,
     )
-    c.add_argument("files", nargs="+", metavar="FILE", help="CSV or Parquet tables, GRACE-FO, AEM, STK or CK files")
+    c.add_argument(
+        "files",
+        nargs="+",
+        metavar="FILE",
+        help="CSV or Parquet tables, GRACE-FO, AEM, STK or CK files; a folder of frames",
+    )
+    c.add_argument("--fov", metavar="DEG", help="of a folder of frames: as of helmstar solve")
+    c.add_argument("--camera", metavar="TOML", help="of a folder of frames: calibrated camera (docs/imaging.md)")
+    c.add_argument("--pixel-aspect", type=float, default=1.0, metavar="R", help="of a folder of frames")
     c.add_argument(
         "--config", metavar="TOML", help="sensors.toml: columns, noise, mounting, gate (see docs/telemetry.md)"
     )
@@ -201,6 +213,29 @@ read noise, dark current, hot pixels, glow. --ra, --dec, --roll are of the image
     c.add_argument("--out", metavar="PATH", help="file, or folder of a sequence (default: frame.png)")
     c.add_argument("--json", action="store_true", help="one JSON object on stdout, progress on stderr")
     c.set_defaults(call=_render)
+
+    c = sub.add_parser(
+        "calibrate",
+        help="camera from many images of stars: focal length, centre, distortion, noise of the centroids",
+        description="""Fit one camera to all images of stars, solved without a prior, and write cam.toml for solve --camera.
+Images that are not solved or have another size are named and left out.
+Exit code: 0 all images were used, 2 some were not, 1 misuse or too few stars.""",
+        epilog="""examples:
+  helmstar calibrate night/*.png --fov 11.4
+  helmstar calibrate *.fits --fov 5..25 --pixel-aspect 1.9 --dark --out cam.toml --plot drawn""",
+        formatter_class=raw,
+    )
+    c.misuse = 1
+    c.add_argument("files", nargs="+", metavar="IMAGE", help="images of stars by one camera")
+    c.add_argument("--fov", metavar="DEG", help="horizontal full field, 11.4, or a range, 5..25 (default: 4..30)")
+    c.add_argument("--camera", metavar="TOML", help="camera to start from")
+    c.add_argument("--pixel-aspect", type=float, metavar="R", help="fit pixel height over width too, from this value")
+    c.add_argument("--time", metavar="UTC", help="time of the images: moves the stars and adds aberration")
+    c.add_argument("--dark", action="store_true", help="estimate the pixels that always shine, beside cam.toml")
+    c.add_argument("--out", metavar="TOML", default="cam.toml", help="file to write (default: cam.toml)")
+    c.add_argument("--plot", metavar="DIR", help="folder for a drawing of the residuals before and after")
+    c.add_argument("--json", action="store_true", help="one JSON object on stdout, progress on stderr")
+    c.set_defaults(call=_calibrate)
 
     c = sub.add_parser(
         "allan",
@@ -345,10 +380,14 @@ def _telemetry(args: argparse.Namespace, unnamed: str) -> dict[str, Any]:
 
 
 def _attitude(args: argparse.Namespace) -> int:
+    from .startracker.command import SolveOptions
     from .telemetry.command import run_attitude
 
     files = [Path(f) for f in args.files]
-    result, report = run_attitude(files, **_telemetry(args, "telemetry"), as_csv=args.csv, aem=args.aem, ck=args.ck)
+    optics = SolveOptions(args.fov, None if args.camera is None else Path(args.camera), args.pixel_aspect)
+    result, report = run_attitude(
+        files, **_telemetry(args, "telemetry"), as_csv=args.csv, aem=args.aem, ck=args.ck, optics=optics
+    )
     if args.json:
         _print_json(result)
     else:
@@ -413,6 +452,21 @@ def _render(args: argparse.Namespace) -> int:
     else:
         print_rendered(result)
     return 0
+
+
+def _calibrate(args: argparse.Namespace) -> int:
+    from .startracker.calibrate_command import CalibrateOptions, print_calibrated, run_calibrate
+    from .startracker.command import SolveOptions
+
+    solve = SolveOptions(fov=args.fov, camera=None if args.camera is None else Path(args.camera), time=args.time)
+    plot = None if args.plot is None else Path(args.plot)
+    options = CalibrateOptions(solve, args.pixel_aspect, Path(args.out), args.dark, plot)
+    result = run_calibrate([Path(f) for f in args.files], options)
+    if args.json:
+        _print_json(result)
+    else:
+        print_calibrated(result)
+    return 0 if all(e["status"] == "used" for e in result["images"]) else 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -27,6 +27,7 @@ BESIDE = {
     ("report", "campaign"),
     ("sensors", "io"),
     ("imaging", "attitude"),
+    ("telemetry", "startracker"),
 }
 UPWARD = {("scenarios", "report"), ("telemetry", "report")}
 

@@ -24,7 +24,7 @@ def test_telemetry_figures_are_valid_for_plotly(spoil):
     shapes = telemetry_figures.gap_shapes(result["gaps"], clock)
     gate = np.full(3000, 10.0)
     for figure in (
-        telemetry_figures.drift(frames, clock, shapes),
+        telemetry_figures.vector(frames, clock, shapes),
         telemetry_figures.attitude_sigma(frames, clock, shapes),
         telemetry_figures.residuals(frames["updates"], clock, shapes),
         telemetry_figures.nis(frames["updates"], clock, shapes, gate),

@@ -56,6 +56,11 @@ def read_fits(data: bytes, max_pixels: int) -> FitsImage:
     raise FitsError("no image in its first 100 parts")
 
 
+def fits_header(data: bytes) -> dict[str, str]:
+    """Cards of the first header of a file that begins with these bytes. Raises FitsError."""
+    return _header(data, 0)[0]
+
+
 def _image(data: bytes, at: int, header: dict[str, str], bitpix: int, axes: list[int], max_pixels: int) -> FitsImage:
     shape = list(reversed(axes))
     while len(shape) > 2 and shape[0] == 1:
@@ -128,4 +133,4 @@ def _number(header: dict[str, str], key: str, default: float) -> float:
     return value
 
 
-__all__ = ["FitsError", "FitsImage", "read_fits"]
+__all__ = ["FitsError", "FitsImage", "fits_header", "read_fits"]

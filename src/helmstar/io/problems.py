@@ -12,7 +12,7 @@ from ..errors import DataError
 
 Kind = Literal[
     "nan", "not_a_number", "ragged", "non_unit", "time_unreadable", "time_backwards", "time_repeated", "frame", "too_fast",
-    "jump", "unit", "flagged", "unused", "early", "no_gyro",
+    "jump", "unit", "flagged", "unused", "early", "no_gyro", "unsolved",
 ]  # fmt: skip
 KINDS: tuple[Kind, ...] = get_args(Kind)
 

@@ -84,9 +84,11 @@ def to_rates(gyro: GyroRows, reading: Reading) -> tuple[GyroRows, Literal["insta
 
 @dataclass(frozen=True)
 class AttitudeRows(Rows):
-    """`q_BN` (n, 4), unit, scalar last; its sign is the file's."""
+    """`q_BN` (n, 4), unit, scalar last; its sign is the file's. `covariance` (n, 3, 3): of each, rad^2, error on the left in B;
+    None where the rows do not say it."""
 
     q_BN: np.ndarray = field(default_factory=lambda: np.empty((0, 4)))
+    covariance: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

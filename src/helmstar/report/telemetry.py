@@ -5,7 +5,9 @@
 | key | holds |
 |---|---|
 | files, command, versions, rows | list of str, str, {name: version}, {what: count} |
-| drift_arcsec_s, drift_sigma_arcsec_s | [x, y, z] at the end |
+| drift_arcsec_s, drift_sigma_arcsec_s | [x, y, z] at the end; None without a gyro |
+| rate_deg_s, rate_sigma_deg_s | the same of the body's rate, where it is a state |
+| frames | star images: {total, status: {word: count}, each: list of {file, time_s, status, message, ra_deg, ..}} |
 | nis_mean, nis_band | mean over the accepted updates, [low, high] of it |
 | rows_rejected, gaps | count, list of {start_s, end_s, duration_s, what} |
 | problems | list of {file, row, kind, message, action}, and `rows` if one stands for several |
@@ -13,9 +15,10 @@
 | calibration | {misalignment_arcsec, scale_factor_ppm: {value, sigma, sigma_before, bound, observable}}, each [x, y, z] |
 | gate_limit, sensors_toml, title, headline | limit of NIS at 3 degrees of freedom; texts |
 
-`frames`: "filtered" and "smoothed" (time_s, q_bn_x .. q_bn_w, drift_x_arcsec_s .., sigma_attitude_x_arcsec ..,
-sigma_drift_x_arcsec_s ..) and "updates" (time_s, nis, nis_dof, status "accepted", "gated", "reopened", "forced" or "restarted",
-residual_x_arcsec .. in B, and optionally residual_sigma_x_arcsec ..). `gaps` and frames share one clock.
+`frames`: "filtered" and "smoothed" (time_s, q_bn_x .. q_bn_w, sigma_attitude_x_arcsec .., and of drift and rate what there is:
+drift_x_arcsec_s .., sigma_drift_x_arcsec_s .., rate_x_deg_s .., sigma_rate_x_deg_s ..) and "updates" (time_s, nis, nis_dof,
+status "accepted", "gated", "reopened", "forced" or "restarted", residual_x_arcsec .. in B, and optionally
+residual_sigma_x_arcsec ..). `gaps` and frames share one clock.
 """
 
 from __future__ import annotations
@@ -44,12 +47,19 @@ def telemetry_page(result: dict[str, Any], frames: Mapping[str, pandas.DataFrame
     """The page of a processed telemetry series, not yet written."""
     files = [str(file) for file in result.get("files") or []]
     names = ", ".join(f"`{Path(file).name}`" for file in files)
-    page = Page(str(result.get("title") or "Attitude and gyro drift from telemetry"), subtitle=names)
+    title = (
+        "Attitude and gyro drift from telemetry"
+        if result.get("drift_arcsec_s")
+        else "Attitude and rate from stars alone"
+    )
+    page = Page(str(result.get("title") or title), subtitle=names)
     page.section("Result")
     page.headline(*_headline(result))
     _add_drift_table(page, result)
+    _add_rate_table(page, result)
     _add_calibration(page, result)
     _add_figures(page, result, frames)
+    _add_images(page, result)
     page.section("Data quality: problems, gaps, refused rows", short="Data quality")
     _add_quality(page, result)
     page.section("Noise parameters and their source", short="Parameters")
@@ -79,6 +89,9 @@ def _headline(result: dict[str, Any]) -> tuple[str, ...]:
     if drift:
         uncertainty = f" ± {', '.join(number(value, 2) for value in sigma)}" if sigma else ""
         parts.append(f"Gyro drift at the end: {', '.join(_fixed(value) for value in drift)}{uncertainty} arcsec/s (1σ)")
+    images = result.get("frames")
+    if images:
+        parts.append(f"{images['status'].get('solved', 0)} of {_count(images['total'], 'frame')} solved")
     mean, limits = result.get("nis_mean"), result.get("nis_band")
     if mean is not None:
         word = ""
@@ -113,6 +126,58 @@ def _add_drift_table(page: Page, result: dict[str, Any]) -> None:
         columns = [Column("Mean NIS", align="left"), Column("Band"), Column("Verdict", align="left")]
         row = [mean, f"{number(limits[0])} to {number(limits[1])}", (chip, text)]
         page.table([*columns], [row])
+
+
+def _add_rate_table(page: Page, result: dict[str, Any]) -> None:
+    rate, sigma = result.get("rate_deg_s"), result.get("rate_sigma_deg_s") or [None] * 3
+    if rate:
+        columns = [
+            Column("Axis of B", align="left"),
+            Column("Rate", "deg/s", digits=6),
+            Column("1σ", "deg/s", digits=2),
+        ]
+        rows = [[name, rate[i], sigma[i]] for i, name in enumerate("xyz")]
+        page.table(columns, rows, caption="Rate of the body at the end of the series.")
+
+
+def _add_images(page: Page, result: dict[str, Any]) -> None:
+    """The star images that stand for attitudes, each with what became of it."""
+    images = result.get("frames")
+    if not images:
+        return
+    page.section("Star images", short="Images")
+    rows = []
+    for e in images["each"][:SHOWN_ROWS]:
+        good = e["status"] == "solved"
+        sigma = e.get("sigma_arcsec")
+        rows.append(
+            [
+                Path(e["file"]).name,
+                e["time_s"],
+                (Chip("good" if good else "bad", e["status"]), e["message"] or ""),
+                e.get("ra_deg"),
+                e.get("dec_deg"),
+                e.get("roll_deg"),
+                max(sigma[:2]) if sigma else None,
+                sigma[2] if sigma else None,
+                e.get("stars"),
+                e.get("residual_rms_arcsec"),
+            ]
+        )
+    columns = [
+        Column("File", align="left"),
+        Column("Time", "s", digits=9),
+        Column("Status", align="left"),
+        Column("RA", "deg", digits=8),
+        Column("Dec", "deg", digits=7),
+        Column("Roll", "deg", digits=7),
+        Column("1σ across", "arcsec", digits=2),
+        Column("1σ roll", "arcsec", digits=2),
+        Column("Stars"),
+        Column("Residual", "arcsec", digits=3),
+    ]
+    caption = "Each image, solved on its own or near where the ones before lead to; those that are not solved are gaps."
+    page.table(columns, rows, caption=_caption("Star images", images["total"]) + " " + caption)
 
 
 def _add_calibration(page: Page, result: dict[str, Any]) -> None:
@@ -161,14 +226,24 @@ def _add_figures(page: Page, result: dict[str, Any], frames: Mapping[str, pandas
     clock = figures.Clock.of(np.concatenate(times))
     gaps = figures.gap_shapes(result.get("gaps") or [], clock)
     grey = " Grey stripes are gaps." if gaps else ""
-    if states:
+    some = next(iter(states.values()), None)
+    if some is not None and "rate_x_deg_s" in some:
+        page.section("Body rate", short="Rate")
+        page.figure(
+            figures.vector(states, clock, gaps, "rate", "deg/s"),
+            f"The body's rate as a state, filtered and smoothed, with 3σ bands.{grey}",
+            alt="Rate of the body per axis in degrees per second over time, filtered and smoothed, with 3 sigma bands.",
+            height=600,
+        )
+    if some is not None and "drift_x_arcsec_s" in some:
         page.section("Gyro drift", short="Drift")
         page.figure(
-            figures.drift(states, clock, gaps),
+            figures.vector(states, clock, gaps),
             f"Both estimates should agree within their 3σ bands; the smoothed one knows the whole series.{grey}",
             alt="Gyro drift per axis in arcseconds per second over time, filtered and smoothed, with 3 sigma bands.",
             height=600,
         )
+    if states:
         page.section("Attitude and its uncertainty", short="Attitude")
         page.figures(
             [

@@ -1,4 +1,4 @@
-"""Figures of filtered telemetry, each a plain dict of plotly's figure JSON: drift, attitude, residuals, NIS.
+"""Figures of filtered telemetry, each a plain dict of plotly's figure JSON: drift, rate, attitude, residuals, NIS.
 
 `Clock` turns seconds into the axis: time since the first sample, in a unit that keeps the numbers short. Gaps are grey
 stripes. Noisy series are thinned to their extremes, and refused rows are always drawn.
@@ -62,22 +62,25 @@ def gap_shapes(gaps: Sequence[Mapping[str, Any]], clock: Clock) -> list[dict[str
     ]  # fmt: skip
 
 
-def drift(frames: Mapping[str, Any], clock: Clock, shapes: list[dict[str, Any]]) -> dict[str, Any]:
-    """Gyro drift per axis, filtered and smoothed, with 3 sigma bands."""
+def vector(
+    frames: Mapping[str, Any], clock: Clock, shapes: list[dict[str, Any]], name: str = "drift", unit: str = "arcsec/s"
+) -> dict[str, Any]:
+    """A vector per axis, filtered and smoothed, with 3 sigma bands: the gyro's drift, or the body's rate."""
+    suffix = unit.replace("/", "_")
     traces: list[dict[str, Any]] = []
     views: dict[str, Any] = {"Settled": {}}
-    for i, name in enumerate(AXES):
+    for i, a in enumerate(AXES):
         place = {**on(i), **({} if i == 0 else {"showlegend": False})}
         settled: list[np.ndarray] = []
         for kind, colour, opacity in (("filtered", style.AMBER, 0.25), ("smoothed", style.BLUE, 0.35)):
             if kind not in frames:
                 continue
             table = frames[kind]
-            value, sigma = _column(table, f"drift_{name}_arcsec_s"), _column(table, f"sigma_drift_{name}_arcsec_s")
+            value, sigma = _column(table, f"{name}_{a}_{suffix}"), _column(table, f"sigma_{name}_{a}_{suffix}")
             index = extremes(value, SMOOTH)
             time, value, sigma = clock(_column(table, "time_s"))[index], value[index], sigma[index]
             traces += band(time, value - 3 * sigma, value + 3 * sigma, f"{kind}, 3σ", colour, opacity, **place)
-            hover = f"%{{x:.5g}} {clock.unit}<br>{name} %{{y:.6g}} arcsec/s"
+            hover = f"%{{x:.5g}} {clock.unit}<br>{a} %{{y:.6g}} {unit}"
             traces.append(line(time, value, kind, colour, width=1.6, hover=hover, **place))
             late = slice(len(value) // 5, None)
             settled += [value[late] - 3 * sigma[late], value[late] + 3 * sigma[late]]
@@ -87,7 +90,7 @@ def drift(frames: Mapping[str, Any], clock: Clock, shapes: list[dict[str, Any]])
             low, high = float(finite.min()), float(finite.max())
             room = 0.08 * (high - low) or 1e-3
             views["Settled"]["yaxis" + ("" if i == 0 else str(i + 1)) + ".range"] = [low - room, high + room]
-    axes = stacked(3, [f"{name} (arcsec/s)" for name in AXES], clock.title, gap=0.04)
+    axes = stacked(3, [f"{a} ({unit})" for a in AXES], clock.title, gap=0.04)
     return {"data": traces, "layout": layout({"views": {**views, "Whole": {}}}, shapes=shapes, **axes)}
 
 

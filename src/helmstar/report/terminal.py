@@ -67,9 +67,18 @@ def _print_attitude_and_drift(summary: dict[str, Any]) -> None:
 
 def print_attitude(result: dict[str, Any]) -> None:
     """Drift, consistency and what was wrong with the rows."""
-    drift, sigma = result["drift_arcsec_s"], result["drift_sigma_arcsec_s"]
-    for axis, d, s in zip("xyz", drift, sigma, strict=True):
-        print(f"drift {axis}: {_number(d, 6)} +- {_number(s, 2)} arcsec/s")
+    frames = result.get("frames")
+    if frames:
+        others = ", ".join(f"{n} {what}" for what, n in frames["status"].items() if what != "solved")
+        print(
+            f"frames: {frames['status'].get('solved', 0)} of {frames['total']} solved"
+            + (f"; {others}" if others else "")
+        )
+    for name, unit in (("drift", "arcsec/s"), ("rate", "deg/s")):
+        key = unit.replace("/", "_")
+        value, sigma = result.get(f"{name}_{key}"), result.get(f"{name}_sigma_{key}")
+        for axis, v, s in zip("xyz", value or (), sigma or ()):
+            print(f"{name} {axis}: {_number(v, 6)} +- {_number(s, 2)} {unit}")
     for name, c in (result.get("calibration") or {}).items():
         unit = name.rsplit("_", 1)[1]
         for axis, v, e, before in zip("xyz", c["value"], c["sigma"], c["sigma_before"], strict=True):

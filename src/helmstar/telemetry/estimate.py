@@ -89,13 +89,16 @@ class Start:
 @dataclass(frozen=True)
 class Estimates:
     """At each instant of the timeline: q_BN (n, 4), drift (n, 3) rad/s, cov (n, 6, 6) in rad and rad/s, axes of B; where they
-    are estimated, misalignment (rad) and scale factors (n, 6), and their sigma (n, 6)."""
+    are estimated, misalignment (rad) and scale factors (n, 6), and their sigma (n, 6); where the rate is a state, that rate
+    (n, 3) rad/s in B and its sigma (n, 3)."""
 
     q_BN: np.ndarray
     drift: np.ndarray
     cov: np.ndarray
     calibration: np.ndarray | None = None
     calibration_sigma: np.ndarray | None = None
+    rate: np.ndarray | None = None
+    rate_sigma: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -283,7 +286,7 @@ def filter_and_smooth(
             gyro_refused += int(np.sum((status == GATED) | (status == REOPENED)))
         infos.append(_info(track.infos[1 if design.states == "rate" else 0 :], n))
         advance()
-    filtered = _joined(kept)
+    filtered = _joined(kept, design)
     smoothed = _smooth(record, model, begins, belief, gate, advance)
     return filtered, smoothed, replace(_updates(record, infos), gyro_refused=gyro_refused)
 
@@ -302,29 +305,50 @@ def _smooth(
         later = Gaussian(jax.tree.map(lambda a: a[0], smoothed.mean), smoothed.cov[0])
         advance()
     parts.append(_first(later, design))
-    return _joined(parts[::-1])
+    return _joined(parts[::-1], design)
 
 
 Numbers = tuple[np.ndarray, ...]
-"""Attitude, drift, the covariance of these, and of a calibration its six numbers and their sigma."""
+"""Attitude, drift, the covariance of these, and of a calibration its six numbers or of a rate its three, and their sigma."""
 
 
 def _numbers(belief: Any, n: int, design: Design) -> Numbers:
     P = np.asarray(belief.cov)[:n]
     out = (np.asarray(belief.mean.q_BN)[:n], np.asarray(belief.mean.b)[:n], P[:, design.six][:, :, design.six])
-    if design.states != "calibration":
+    if design.states == "drift":
         return out
+    sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
+    if design.states == "rate":
+        return (*out, np.asarray(belief.mean.omega)[:n], sigma[:, 3:6])
     found = np.concatenate([np.asarray(belief.mean.misalignment)[:n], np.asarray(belief.mean.scale)[:n]], axis=1)
-    return (*out, found, np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2)[:, 6:], 0.0)))
+    return (*out, found, sigma[:, 6:])
 
 
 def _first(belief: Any, design: Design) -> Numbers:
     return _numbers(jax.tree.map(lambda a: jnp.asarray(a)[None], belief), 1, design)
 
 
-def _joined(parts: list[Numbers]) -> Estimates:
-    q, *rest = (np.concatenate(x) for x in zip(*parts, strict=True))
-    return Estimates(continuous(q), *rest)
+def _joined(parts: list[Numbers], design: Design) -> Estimates:
+    q, drift, cov, *beside = (np.concatenate(x) for x in zip(*parts, strict=True))
+    names = {"drift": (), "calibration": ("calibration", "calibration_sigma"), "rate": ("rate", "rate_sigma")}
+    return Estimates(continuous(q), drift, cov, **dict(zip(names[design.states], beside, strict=True)))
+
+
+def log_likelihood(record: Record, start: Start, limit: float) -> float:
+    """Log likelihood of the whole attitudes by the filter's innovations, each NIS cut at `limit`, so that an outlier counts no more
+    than the gate would take it for."""
+    model, filter = model_of(record.levels, record.single, record.design), record.design.filter
+    belief = initial_belief(start, record.design, record.timeline.rate[0])
+    refused, gate, total = jnp.zeros(len(model.sensors), dtype=int), no_gate(), 0.0
+    for i in range(record.chunks):
+        u, dt, m = record.chunk(i)
+        belief, refused, track = _forward(filter, model, belief, refused, u, dt, m, gate)
+        info = track.infos[1 if record.design.states == "rate" else 0]
+        used = np.asarray(info.dof)[: record.length(i)] > 0
+        log_det = np.linalg.slogdet(np.asarray(info.S)[: record.length(i)])[1]
+        nis = np.asarray(info.nis)[: record.length(i)]
+        total -= 0.5 * float(np.sum(np.where(used, np.minimum(nis, limit) + log_det, 0.0)))
+    return total
 
 
 def _info(infos: tuple[Any, ...], n: int) -> tuple[np.ndarray, ...]:

@@ -32,7 +32,8 @@ NOT_USED = "not used"
 @dataclass(frozen=True)
 class Solution:
     """All that was estimated of one record. `gyro`: the rows that were used; `used` (m,): the epochs that entered;
-    `sources`: where each noise level and the start's drift and its sigma are from."""
+    `sources`: where each noise level and the start's drift and its sigma are from; `rate_sigma`: of a record without gyro, the
+    random walk of its rate, rad/s/sqrt(s)."""
 
     gyro: GyroRows
     timeline: Timeline
@@ -47,6 +48,7 @@ class Solution:
     problems: tuple[Problem, ...]
     gate: Gate
     calibration: Calibration | None = None
+    rate_sigma: float | None = None
 
 
 def solve(
@@ -58,6 +60,10 @@ def solve(
     `sensors` speaks of what the rows cannot have; ValueError when the record
     was read with other time offsets.
     """
+    if not len(telemetry.gyro) and len(telemetry.attitude):
+        from .attitude_only import solve_attitudes
+
+        return solve_attitudes(telemetry, sensors, strict, progress)
     if telemetry.offsets != sensors.time_offsets:
         raise ValueError(
             f"the record was read with {telemetry.offsets}, the configuration says {sensors.time_offsets}: give "
@@ -86,8 +92,9 @@ def _solve(telemetry: Telemetry, sensors: SensorsConfiguration, strict: bool, pr
         epochs = _within(signal, epochs, problems)
         bar.finish(task)
         task = bar.add("start and noise", 1)
-        gate = _gate(sensors)
-        ready, calibration = _calibrated(signal, epochs, sensors, gate)
+        gate = the_gate(sensors)
+        measured = telemetry.attitude.covariance is not None
+        ready, calibration = _calibrated(signal, epochs, sensors, gate, measured)
         problems += ready.problems
         record, epochs = ready.record, ready.record.epochs
         bar.finish(task)
@@ -97,7 +104,7 @@ def _solve(telemetry: Telemetry, sensors: SensorsConfiguration, strict: bool, pr
     if not all(np.isfinite(x).all() for e in (filtered, smoothed) for x in (e.q_BN, e.drift, e.cov)):
         raise DataError("the filter did not stay finite; check the noise in sensors.toml against the data's units")
     filtered, smoothed = (_doubted(e, updates) for e in (filtered, smoothed))
-    problems += _refused(record.timeline, epochs, updates, gate)
+    problems += problems_of(record.timeline, epochs, updates, gate)
     if updates.gyro_refused:
         message = f"{updates.gyro_refused} steps whose gyro rate does not fit the rate as a state; see rate_sigma_deg_s"
         problems.append(Problem(gyro.files[0], int(gyro.row[0]), "jump", message, "dropped", updates.gyro_refused))
@@ -121,12 +128,14 @@ class _Ready:
 
 
 def _ready(
-    signal: RateSignal, epochs: Epochs, sensors: SensorsConfiguration, gate: Gate, considered: tuple[int, ...] = ()
-) -> _Ready:
-    """Start, noise and timeline of a record; `considered`: numbers of a calibration that are not estimated."""
+    signal: RateSignal, epochs: Epochs, sensors: SensorsConfiguration, gate: Gate, measured: bool,
+    considered: tuple[int, ...] = (),
+) -> _Ready:  # fmt: skip
+    """Start, noise and timeline of a record; `measured`: whether attitudes have covariances of their own; `considered`: numbers
+    of a calibration that are not estimated."""
     problems: list[Problem] = []
     signal = with_policy(signal, sensors.gyro)
-    epochs, used, beginning, levels, sources = _begin(signal, epochs, sensors, gate, problems)
+    epochs, used, beginning, levels, sources = _begin(signal, epochs, sensors, gate, problems, measured)
     timeline = build_timeline(signal, epochs)
     start, start_sources = _start(sensors, epochs, levels, beginning, timeline, used)
     record = Record(timeline, epochs, levels, used, _design(sensors, timeline, considered))
@@ -134,21 +143,21 @@ def _ready(
 
 
 def _calibrated(
-    signal: RateSignal, epochs: Epochs, sensors: SensorsConfiguration, gate: Gate
+    signal: RateSignal, epochs: Epochs, sensors: SensorsConfiguration, gate: Gate, measured: bool
 ) -> tuple[_Ready, Calibration | None]:
     """The record made ready. Of a calibration first the bound, with all of its numbers unknown; what the record then shows
     is estimated, and the rest counts as uncertainty."""
     prior = sensors.calibrate.sigma
     if not prior.any():
-        return _ready(signal, epochs, sensors, gate), None
+        return _ready(signal, epochs, sensors, gate, measured), None
     rough = rough_calibration(signal, epochs, prior)
-    ready = _ready(corrected(signal, rough), epochs, sensors, gate)
+    ready = _ready(corrected(signal, rough), epochs, sensors, gate, measured)
     bound = final_sigma(ready.record, ready.start)[6:]
     shown = observed(prior, bound)
     if not np.array_equal(shown, prior > 0.0):
         rough = np.where(shown, rough, 0.0)
         rest = tuple(int(i) for i in np.flatnonzero((prior > 0.0) & ~shown))
-        ready = _ready(corrected(signal, rough), epochs, sensors, gate, rest)
+        ready = _ready(corrected(signal, rough), epochs, sensors, gate, measured, rest)
     return ready, Calibration(prior, rough, bound, shown)
 
 
@@ -186,7 +195,7 @@ def _liveliness(timeline: Timeline) -> float:
     return float(np.max(change, initial=1e-6))
 
 
-def _gate(sensors: SensorsConfiguration) -> Gate:
+def the_gate(sensors: SensorsConfiguration) -> Gate:
     """The filter's gate; a probability of 0 refuses nothing."""
     f = sensors.filter
     return chi_square_gate(f.gate_probability, reopen_after=f.reopen_after) if f.gate_probability else no_gate()
@@ -203,8 +212,7 @@ def _inputs(
             problems.append(
                 Problem(directions.files[0], int(directions.row[0]), "unused", message, NOT_USED, len(directions))
             )
-        shape = sensors.star.covariance_B()
-        epochs = attitude_epochs(attitude, np.eye(3) if shape is None else shape)
+        epochs = attitude_epochs(attitude, measured_shape(attitude, sensors))
     elif directions is not None:
         _refuse_axes(sensors)
         sigma_S = sensors.star.sigma_S
@@ -224,6 +232,15 @@ def _inputs(
     rates, reading = to_rates(gyro, sensors.gyro.reading)
     increments = gyro.quantity == "increment" or sensors.gyro.reading == "increment_rad"
     return gyro, rate_signal(rates.time, rates.value, rates.step, reading, increments), epochs
+
+
+def measured_shape(attitude: AttitudeRows, sensors: SensorsConfiguration) -> np.ndarray:
+    """Covariance (3, 3) or (n, 3, 3) of attitudes in B: what the configuration states, else the rows' own, in rad^2; else the
+    identity, in units of a sigma that the data have to tell."""
+    stated = sensors.star.covariance_B()
+    if stated is not None:
+        return stated
+    return np.eye(3) if attitude.covariance is None else attitude.covariance
 
 
 def _refuse_axes(sensors: SensorsConfiguration) -> None:
@@ -274,7 +291,12 @@ def _note(problems: list[Problem], epochs: Epochs, which: np.ndarray, kind: Kind
 
 
 def _begin(
-    signal: RateSignal, epochs: Epochs, sensors: SensorsConfiguration, gate: Gate, problems: list[Problem]
+    signal: RateSignal,
+    epochs: Epochs,
+    sensors: SensorsConfiguration,
+    gate: Gate,
+    problems: list[Problem],
+    measured: bool,
 ) -> tuple[Epochs, np.ndarray, Beginning, NoiseLevels, dict[str, str]]:
     """Epochs from the first right one on, which of them to use, the beginning, the noise levels and where these come from."""
     timeline = build_timeline(signal, epochs)
@@ -282,7 +304,7 @@ def _begin(
     series = bring_back(timeline, epochs, np.zeros(3))
     # Once more without the drift: what is left is small, and first order suffices.
     series = bring_back(timeline, epochs, np.median(series.drifts(), axis=0))
-    known = _known(sensors, epochs)
+    known = _known(sensors, epochs, measured)
     levels = rough_levels(series, known)
     beginning = find_beginning(series, levels, limit)
     if len(known) < len(NAMES):
@@ -297,15 +319,17 @@ def _begin(
     used[beginning.wrong] = False
     from_here = np.arange(beginning.epoch, len(epochs))
     sources = {n: "sensors.toml" if n in known else "estimated from the data" for n in NAMES}
+    if measured and sensors.star.sigma_S is None:
+        sources["sigma"] = "of each frame by its stars"
     if len(series) <= ENOUGH and "sigma_u" not in known:
         sources["sigma_u"] = "taken as 0: too few attitudes to tell"
     return epochs.select(from_here), used[from_here], beginning, levels, sources
 
 
-def _known(sensors: SensorsConfiguration, epochs: Epochs) -> dict[str, float]:
-    """The noise levels that the configuration states."""
+def _known(sensors: SensorsConfiguration, epochs: Epochs, measured: bool) -> dict[str, float]:
+    """The noise levels that the configuration states, or (measured) the attitudes themselves."""
     sigma_S = sensors.star.sigma_S
-    sigma = None if sigma_S is None else float(sigma_S[0]) if epochs.directions else 1.0
+    sigma = (1.0 if measured else None) if sigma_S is None else float(sigma_S[0]) if epochs.directions else 1.0
     given = {"sigma_v": sensors.gyro.arw, "sigma_u": sensors.gyro.rrw, "sigma": sigma}
     return {name: value for name, value in given.items() if value is not None}
 
@@ -358,7 +382,7 @@ def _doubted(e: Estimates, updates: Updates) -> Estimates:
     return replace(e, cov=cov)
 
 
-def _refused(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate) -> list[Problem]:
+def problems_of(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate) -> list[Problem]:
     """Measurements that the gate did not take, and those taken because it had refused too many in a row."""
     limits = np.asarray(gate.limits)
     out = []
@@ -375,4 +399,4 @@ def _refused(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate) -
     return out
 
 
-__all__ = ["FROM_ATTITUDES", "NOT_USED", "Solution", "solve"]
+__all__ = ["FROM_ATTITUDES", "NOT_USED", "Solution", "measured_shape", "problems_of", "solve", "the_gate"]
