@@ -1,15 +1,15 @@
 """A camera from stars that were identified in many frames: one lens for all, an attitude for each.
 
-Least squares of pixel residuals over their sigma with a robust loss (scipy, trust region, analytic Jacobian). Attitudes are left
-perturbations R_SN = exp([d x]) R_0, and R_0 is renewed between rounds. Lens parameters have wide priors, so that a
-distortion that the stars do not show stays zero instead of running away against focal length and attitudes.
+Least squares of pixel residuals over their sigma with a robust loss (the soft absolute value, by damped Gauss and Newton's
+steps with an analytic Jacobian). Attitudes are left perturbations R_SN = exp([d x]) R and are eliminated frame by frame, so
+that hundreds of frames cost little. Lens parameters have wide priors, so that a distortion that the stars do not show
+stays zero instead of running away against focal length and attitudes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from .camera import Camera
 
 PARAMETERS = ("focal", "cx", "cy", "aspect", "k1", "k2", "p1", "p2", "k3")
 DEFAULT = ("focal", "cx", "cy", "k1", "k2", "p1", "p2")
-_ROUNDS = 12
+_ROUNDS, _STEPS = 12, 40
 _OUTLIER = 5.0
 _OPEN = 0.3
 """A parameter whose sigma is more than this share of its prior's was not seen by the stars."""
@@ -76,6 +76,26 @@ def calibrate(frames: Sequence[Matches], start: Camera, fit: Sequence[str] = DEF
         if moved < 1e-9:
             break
     return problem.result(p, R, len(frames))
+
+
+def derivative(camera: Camera, names: Sequence[str], directions_S: np.ndarray) -> np.ndarray:
+    """Derivative (n, 2, p) of the pixels of directions in S (n, 3) by parameters of the camera."""
+    n = len(directions_S)
+    one = _Problem(
+        np.zeros((n, 2)), directions_S, np.ones(n), np.zeros(n, int), 1, camera, tuple(names), np.ones(len(names))
+    )
+    p = np.array([_get(camera, name) for name in names])
+    return one.residual(p, np.eye(3)[None])[1][:, :, : len(names)]
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """information (p, p) and gradient (p,) of the lens alone; turns: for each frame its turn (3,) without a step of the lens, and
+    what it loses (3, p) with one."""
+
+    information: np.ndarray
+    gradient: np.ndarray
+    turns: list[tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass
@@ -149,44 +169,65 @@ class _Problem:
         s = self.sigma[:, None]
         return (self.xy - predicted) / s, np.concatenate([lens, turned], axis=2) / s[..., None]
 
-    def jacobian(self, blocks: np.ndarray) -> np.ndarray:
-        """(2 n + p, p + 3 frames) of all residuals, those of the priors last."""
-        n, p = len(self.xy), len(self.names)
-        J = np.zeros((2 * n + p, p + 3 * self.count))
-        rows = np.arange(2 * n).reshape(n, 2)
-        J[: 2 * n, :p] = -blocks[..., :p].reshape(2 * n, p)
-        for k in range(3):
-            J[rows, (p + 3 * self.frame + k)[:, None]] = -blocks[..., p + k]
-        J[2 * n :, :p] = np.diag(1.0 / self.prior)
-        return J
+    def reduced(self, blocks: np.ndarray, r: np.ndarray, w: np.ndarray, p: np.ndarray) -> _Reduced:
+        """The normal equations for residuals r (n, 2) of weights w (n, 2), each frame's turn eliminated."""
+        size = len(p)
+        J = blocks * np.sqrt(w)[..., None]
+        y = r * np.sqrt(w)
+        information = np.diag(self.prior**-2.0)
+        gradient = (np.array([_get(self.start, n) for n in self.names]) - p) / self.prior**2
+        turns = []
+        for k in range(self.count):
+            mine = slice(*np.searchsorted(self.frame, [k, k + 1]))
+            B, z = J[mine].reshape(-1, size + 3), y[mine].ravel()
+            N, g = B.T @ B, B.T @ z
+            both, own = N[:size, size:], N[size:, size:] + 1e-12 * np.trace(N[size:, size:]) * np.eye(3)
+            X = np.linalg.solve(own, np.column_stack([both.T, g[size:]]))
+            information += N[:size, :size] - both @ X[:, :size]
+            gradient += g[:size] - both @ X[:, size]
+            turns.append((X[:, size], X[:, :size]))
+        return _Reduced(information, gradient, turns)
 
     def solve(self, p: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """One round from lens p and attitudes R; the last number is how far it moved, over the start's sigma scale."""
-        from scipy.optimize import least_squares
+        """One round from lens p and attitudes R; the last number is how far it moved, over the priors' sigma."""
         from scipy.spatial.transform import Rotation
 
-        first = np.array([_get(self.start, n) for n in self.names])
-        size = len(p)
-
-        def at(v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            turns = Rotation.from_rotvec(v[size:].reshape(-1, 3)).as_matrix()
-            return self.residual(v[:size], turns @ R)
-
-        def fun(v: np.ndarray) -> np.ndarray:
-            r = at(v)[0]
-            return np.concatenate([np.nan_to_num(r, nan=1e6).ravel(), (v[:size] - first) / self.prior])
-
-        def jac(v: np.ndarray) -> np.ndarray:
-            return self.jacobian(np.nan_to_num(at(v)[1]))
-
-        start = np.concatenate([p, np.zeros(3 * self.count)])
-        scale = np.concatenate([self.prior, np.full(3 * self.count, 0.01)])
+        r, blocks = self.residual(p, R)
         # From a wrong camera every star is an outlier: the loss is as wide as the residuals are, round by round.
-        wide = max(2.0, 2.0 * float(np.nanmedian(np.abs(at(start)[0]))))
-        options: dict[str, Any] = {"jac": jac, "loss": "soft_l1", "f_scale": wide, "x_scale": scale, "max_nfev": 100}
-        found = least_squares(fun, start, xtol=1e-14, ftol=1e-14, gtol=1e-12, **options)
-        turns = Rotation.from_rotvec(found.x[size:].reshape(-1, 3)).as_matrix()
-        return found.x[:size], turns @ R, float(np.max(np.abs((found.x - start) / scale)))
+        wide = max(2.0, 2.0 * float(np.nanmedian(np.abs(r))))
+        first, damping, moved = np.array([_get(self.start, n) for n in self.names]), 0.0, 0.0
+
+        def cost(r: np.ndarray, p: np.ndarray) -> float:
+            # The soft absolute value: rho(z) = 2 (sqrt(1 + z) - 1)
+            return float(
+                2 * wide**2 * np.sum(np.sqrt(1 + (r / wide) ** 2) - 1) + np.sum(((p - first) / self.prior) ** 2)
+            )
+
+        now = cost(np.nan_to_num(r, nan=1e6), p)
+        for _ in range(_STEPS):
+            bad = ~np.isfinite(r)
+            weight = np.where(bad, 0.0, 1.0 / np.sqrt(1 + (np.where(bad, 0.0, r) / wide) ** 2))
+            it = self.reduced(np.nan_to_num(blocks), np.where(bad, 0.0, r), weight, p)
+            step = np.zeros(len(p))
+            if len(p):
+                scaled = it.information * self.prior * self.prior[:, None]
+                scaled += damping * np.diag(np.diagonal(scaled))
+                step = np.linalg.solve(scaled, it.gradient * self.prior) * self.prior
+            turns = np.array([own - both @ step for own, both in it.turns])
+            p2, R2 = p + step, Rotation.from_rotvec(turns).as_matrix() @ R
+            r2, blocks2 = self.residual(p2, R2)
+            after = cost(np.nan_to_num(r2, nan=1e6), p2)
+            if not after <= now * (1 + 1e-12) + 1e-18:
+                damping = max(10.0 * damping, 1e-3)
+                if damping > 1e6:
+                    break
+                continue
+            size = max(float(np.max(np.abs(step / self.prior), initial=0.0)), float(np.abs(turns).max()) / 0.01)
+            moved, damping = max(moved, size), 0.1 * damping if damping > 1e-6 else 0.0
+            p, R, r, blocks, now = p2, R2, r2, blocks2, after
+            if size < 1e-10:
+                break
+        return p, R, moved
 
     def result(self, p: np.ndarray, R: np.ndarray, frames: int) -> Calibration:
         """Outliers out, then covariance and residuals."""
@@ -199,14 +240,13 @@ class _Problem:
         if np.any(np.bincount(self.frame[kept], minlength=self.count) < 2):
             kept[:] = True
         size = len(p)
-        J = self.jacobian(blocks)
-        J[: 2 * len(kept)] *= np.repeat(kept, 2)[:, None]
         chi2, degrees = float(np.sum(r[kept] ** 2)), 2 * int(kept.sum()) - 3 * self.count - size
         if degrees < 1:
             raise DataError(
                 f"{int(kept.sum())} stars agree: too few for {size} lens parameters and {self.count} attitudes"
             )
-        covariance = np.linalg.inv(J.T @ J)[:size, :size] * max(1.0, chi2 / degrees)
+        information = self.reduced(blocks, r, np.repeat(kept[:, None], 2, axis=1).astype(float), p).information
+        covariance = np.linalg.inv(information) * max(1.0, chi2 / degrees)
         if "focal" in self.names:
             k = self.names.index("focal")
             if np.sqrt(covariance[k, k]) > _OPEN * self.prior[k]:

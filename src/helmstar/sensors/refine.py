@@ -24,6 +24,7 @@ import numpy as np
 
 from ..attitude import quaternion_of_matrix
 from ..imaging import Camera, Centroids
+from ..imaging.calibrate import Calibration, derivative
 from ..imaging.calibrated import Calibrated
 from ..stars.identify import Identification, matrix_of_quaternion
 from ..stars.patterns import Sky
@@ -69,6 +70,25 @@ class LensPrior:
         focal = 5e-4 if known.focal_sigma_px is None else float(np.hypot(known.focal_sigma_px / camera.focal_px, 1e-4))
         centre = 0.002 * camera.width if known.centre_sigma_px is None else known.centre_sigma_px
         return cls(focal, centre, 0.001 / corner**2 if known.k1_sigma is None else known.k1_sigma)
+
+
+def lens_sigmas(fit: Calibration) -> tuple[float, float, float]:
+    """1 sigma of focal length (relative), centre (px) and k1 that move pixels as a calibration's whole covariance does.
+
+    A calibration's parameters are correlated, and more than `LensPrior` has: what they leave open of the image, over a grid, is
+    projected on turns (which belong to the attitude), focal length, centre and k1.
+    """
+    camera, names = fit.camera, fit.names
+    grid = np.stack(np.meshgrid(np.linspace(0.05, 0.95, 8), np.linspace(0.05, 0.95, 8)), axis=-1).reshape(-1, 2)
+    d = camera.directions(grid * [camera.width, camera.height])
+    d = d[np.isfinite(d).all(axis=1)]
+    _, J = _Lens.of(camera, LensPrior.uncalibrated(camera, 1.0)).predict(np.eye(3), np.zeros(4), d)
+    J = J.reshape(-1, 7)
+    open_ = derivative(camera, names, d).reshape(-1, len(names))
+    scale = np.linalg.norm(J, axis=0)
+    A = np.linalg.lstsq(J / scale, open_, rcond=1e-6)[0] / scale[:, None]
+    sigma = np.sqrt(np.maximum(np.diagonal(A @ fit.covariance @ A.T), 0.0))
+    return float(sigma[3]), float(max(sigma[4], sigma[5] * camera.aspect)), float(sigma[6])
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import time
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -101,6 +102,12 @@ class StarTracker:
             self.sky = _sky(julian_year, _plain(velocity_c), _plain(position_au))
         else:
             self.sky = Sky(catalog, julian_year, velocity_c, position_au)
+
+    def with_camera(self, known: Calibrated) -> StarTracker:
+        """The same with another camera."""
+        other = copy(self)
+        other.known, other.camera, other.fov_deg = known, known.camera, None
+        return other
 
     def solve(
         self, image: Image, *, prior_q_SN: np.ndarray | None = None, prior_sigma: float | None = None

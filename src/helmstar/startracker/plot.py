@@ -47,6 +47,39 @@ def draw(image: Image, found: StarSolution, path: Path) -> Path:
     return path
 
 
+def draw_residuals(
+    path: Path, size: tuple[int, int], before: tuple[np.ndarray, np.ndarray], after: tuple[np.ndarray, np.ndarray]
+) -> Path:
+    """Write a PNG of a calibration and return its path: residual vectors over the field with the camera that it started from and
+    with the fitted one, each panel with its own scale and a bar. size: of the image, px; places and residuals (n, 2), px."""
+    from PIL import Image as Picture
+    from PIL import ImageDraw
+
+    scale = 760.0 / max(size)
+    width, height = round(size[0] * scale), round(size[1] * scale)
+    picture = Picture.new("RGB", (2 * width + 60, height + 80), (16, 18, 24))
+    pen = ImageDraw.Draw(picture)
+    for n, (name, (xy, residual)) in enumerate((("before", before), ("after", after))):
+        left, top = 20 + n * (width + 20), 40
+        pen.rectangle((left, top, left + width, top + height), outline=(90, 96, 110))
+        length = np.hypot(residual[:, 0], residual[:, 1])
+        longest = max(float(np.percentile(length, 90)), 1e-6) if len(length) else 1.0
+        enlarged = 30.0 / (longest * scale)
+        for (x, y), (dx, dy) in zip(xy, residual):
+            a, b = left + (x + 0.5) * scale, top + (y + 0.5) * scale
+            pen.ellipse((a - 1.5, b - 1.5, a + 1.5, b + 1.5), fill=FOUND)
+            pen.line((a, b, a + dx * scale * enlarged, b + dy * scale * enlarged), fill=MATCHED if n else WRONG)
+        rms = float(np.sqrt(np.mean(residual**2))) if len(length) else 0.0
+        pen.text((left, 16), f"{name}: {rms:.3g} px rms per axis, {len(xy)} stars", fill=(255, 255, 255))
+        bar = 10.0 ** np.floor(np.log10(longest))
+        reach = bar * scale * enlarged
+        pen.line((left, top + height + 16, left + reach, top + height + 16), fill=(255, 255, 255), width=2)
+        pen.text((left + reach + 8, top + height + 10), f"{bar:.3g} px", fill=(255, 255, 255))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture.save(path)
+    return path
+
+
 def _stretched(array: np.ndarray) -> np.ndarray:
     """8 bits, from the median to the 99.9th percentile, so that faint stars show."""
     sample = array[:: max(array.shape[0] // 512, 1), :: max(array.shape[1] // 512, 1)]
