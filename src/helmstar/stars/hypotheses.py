@@ -9,53 +9,100 @@ needs only two of the detections to be real and in the table, and what it tolera
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from .patterns import EMPTY, FAINT, RUNG, SHORTEST, Level, Pairs, SkyMap
+from .patterns import EMPTY, FAINT, RUNG, SHORTEST, Level, Pairs, Sky, SkyMap
 from .verify import Detections, Freedom
 
-FIRST_TEST, FIRST_KEPT, FEW = 10, 400, 1500
-"""Detections that every hypothesis is tried on, and the number of hypotheses that are then tried on all; of FEW or more
-hypotheses in a chunk, twice as many detections and at least a twentieth."""
-MOST_PAIRED, MOST_PAIRED_LATER, MOST_PAIRED_KNOWN = 26, 50, 100
-"""Detections that are paired at first; when those are exhausted; and where calibrated magnitudes leave few catalogue pairs for
-each."""
+FIRST_TEST = 14
+"""Detections that every hypothesis is tried on."""
+FIRST_KEPT, FIRST_SHARE = 400, 0.05
+"""Number and share of the hypotheses of a chunk, at least, that are then tried on all detections."""
 FIRST_CHUNK, CHUNK = 2000, 24000
 """Candidate catalogue pairs that are looked at in one go."""
+BLOCK = 2000
+"""Hypotheses that are scored in one go: what stays in the processor's cache."""
 PAIR_GATE, MAGNITUDE_GATE = 3.0, 2.2
 """Separations and magnitude differences may be off by this many sigma."""
 FIELD_REACH = 0.70
 """Longest pairs of detections, over the field."""
 MAGNITUDES = np.where(np.arange(256) == EMPTY, 1e6, np.arange(256) * 0.05 - 2.0).astype(np.float32)
 """Of the sky map's values."""
+SAMPLE = 40
+"""Detection pairs from which the catalogue pairs per detection pair are estimated."""
 
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """R (c, 3, 3) = R_SN, f (c,) px, score (c,): detections that hit something, weighed; the best first."""
+    """R (c, 3, 3) = R_SN, f (c,) px, score (c,): the pair's two and the other detections that hit something, weighed; the best
+    first."""
 
     R: np.ndarray
     f: np.ndarray
     score: np.ndarray
 
 
-def detection_pairs(d: Detections, later: bool = False) -> np.ndarray:
-    """(m, 2) indices of pairs to try, the brightest first, neither too short for a good lever nor too long for the tables.
+@dataclass
+class Stage:
+    """One depth of the pair tables, with what was tried of it: pairs[:begin] (m, 2) of the detections.
 
-    later: those that the first call left out.
+    levels: indices into the ladder with their share of the focal lengths; prior: how probable it is that this depth succeeds
+    where the others fail; cost: catalogue pairs per detection pair.
     """
-    calibrated = d.zero_point is not None and d.magnitude is not None
-    at_first = MOST_PAIRED_KNOWN if calibrated else MOST_PAIRED
-    n = min(len(d), max(at_first, MOST_PAIRED_LATER) if later else at_first)
-    i, j = np.triu_indices(n, 1)
+
+    sky: Sky
+    n: int
+    d: Detections
+    pairs: np.ndarray
+    levels: list[tuple[int, Freedom]]
+    prior: float = 1.0
+    begin: int = 0
+    _cost: float | None = field(default=None, repr=False)
+
+    @property
+    def cost(self) -> float:
+        if self._cost is None:
+            total = 0
+            for k, part in self.levels:
+                table = thinned(self.sky.level(k).pairs(self.n), self.sky.level(k).catalog.magnitude, self.d)
+                total += int(_spans(table, self.d, self.pairs[:SAMPLE], part)[1].sum())
+            # Without magnitudes each is laid both ways, which takes that much longer.
+            self._cost = total / max(min(len(self.pairs), SAMPLE), 1) * (1.4 if self.d.magnitude is None else 1.0)
+        return self._cost
+
+    def worth_trying(self, worth: float) -> int:
+        """How many of the detection pairs promise at least `worth` solutions per catalogue pair.
+
+        If the share of detections that are stars of the table may be anything, evenly, all pairs of K of them fail with
+        probability 2/(K + 1), at most one of the K being a star. The next detection brings K pairs and 2/((K + 1)(K + 2)) of
+        success: about 2/K^3 for each pair.
+        """
+        K = (2.0 * self.prior / (worth * max(self.cost, 1.0))) ** (1.0 / 3.0)
+        n = len(self.d)
+        return round(len(self.pairs) * min(1.0, K * (K - 1.0) / (n * (n - 1.0)))) if K > 1.0 else 0
+
+    def hypotheses(self, worth: float, keep: int, chunk: int) -> Iterator[tuple[int, int, Hypotheses | None]]:
+        """Level, catalogue pairs looked at and ranked hypotheses, in chunks, of the pairs that are worth it and not yet tried."""
+        end = self.worth_trying(worth)
+        if end <= self.begin:
+            return
+        some, self.begin = self.pairs[self.begin : end], end
+        for k, part in self.levels:
+            for looked, found in hypotheses(self.sky.level(k), self.n, self.d, some, part, keep, chunk):
+                yield k, looked, found
+
+
+def detection_pairs(d: Detections) -> np.ndarray:
+    """(m, 2) indices of pairs to try, the brightest first, neither too short for a good lever nor too long for the tables."""
+    i, j = np.triu_indices(len(d), 1)
     length = np.hypot(*(d.xy[i] - d.xy[j]).T)
-    field = np.sqrt(d.area)
-    keep = (length > 1.5 * SHORTEST * field) & (length < FIELD_REACH * field) & ((j >= at_first) | (not later))
+    side = np.sqrt(d.area)
+    keep = (length > 1.5 * SHORTEST * side) & (length < FIELD_REACH * side)
     i, j, length = i[keep], j[keep], length[keep]
     # Sums of ranks, not the later rank: one false bright object must not spoil the first n - 1 trials.
-    order = np.argsort(i + j + 0.5 * np.abs(length / field - 0.35), kind="stable")
+    order = np.argsort(i + j + 0.5 * np.abs(length / side - 0.35), kind="stable")
     return np.stack([i[order], j[order]], axis=1)
 
 
@@ -72,14 +119,8 @@ def separations(d: Detections, pairs: np.ndarray, f: float) -> np.ndarray:
     return 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
 
 
-def hypotheses(
-    level: Level, n: int, d: Detections, pairs: np.ndarray, freedom: Freedom, keep: int, chunk: int = FIRST_CHUNK
-) -> Iterator[tuple[int, Hypotheses | None]]:
-    """Chunks of ranked hypotheses of the n-star table, each with the number of catalogue pairs it looked at.
-
-    The first chunk has `chunk` catalogue pairs or more, every later one twice as many, up to CHUNK.
-    """
-    table = thinned(level.pairs(n), level.catalog.magnitude, d)
+def _spans(table: Pairs, d: Detections, pairs: np.ndarray, freedom: Freedom) -> tuple[np.ndarray, np.ndarray]:
+    """First row and number of rows (m,) of the table that have each pair's separation."""
     sigma = d.sigma[pairs]
     slack = PAIR_GATE * np.hypot(sigma[:, 0], sigma[:, 1])
     if freedom.free:
@@ -90,7 +131,18 @@ def hypotheses(
         slack = slack / freedom.f_known + PAIR_GATE * freedom.sigma * angle
         begin, end = angle - slack, angle + slack
     first = np.searchsorted(table.angle, begin.astype(np.float32), side="left")
-    count = np.maximum(np.searchsorted(table.angle, end.astype(np.float32), side="right") - first, 0)
+    return first, np.maximum(np.searchsorted(table.angle, end.astype(np.float32), side="right") - first, 0)
+
+
+def hypotheses(
+    level: Level, n: int, d: Detections, pairs: np.ndarray, freedom: Freedom, keep: int, chunk: int = FIRST_CHUNK
+) -> Iterator[tuple[int, Hypotheses | None]]:
+    """Chunks of ranked hypotheses of the n-star table, each with the number of catalogue pairs it looked at.
+
+    The first chunk has `chunk` catalogue pairs or more, every later one twice as many, up to CHUNK.
+    """
+    table = thinned(level.pairs(n), level.catalog.magnitude, d)
+    first, count = _spans(table, d, pairs, freedom)
     total = np.cumsum(count)
     start = 0
     while start < len(pairs):
@@ -157,24 +209,54 @@ def focal_lengths(d: Detections, i, j, cosine: np.ndarray) -> np.ndarray:
         return np.sqrt((-B + np.sqrt(B * B - 4.0 * A * C)) / (2.0 * A))
 
 
-def _frame(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit vectors (3, h) along the sum, the difference and the normal of unit directions (3, h): errors shared evenly."""
-    total, difference = first + second, first - second
-    x, y = total, difference
-    normal = np.stack([x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]])
-    tt, dd = (total * total).sum(axis=0), (difference * difference).sum(axis=0)
-    return total / np.sqrt(tt), difference / np.sqrt(dd), normal / np.sqrt(tt * dd)
+def _axes(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Orthonormal rows (h, 3, 3) along the sum, the difference and the normal of unit directions (h, 3): errors shared evenly."""
+    axes = np.stack([first + second, first - second, np.cross(second, first)], axis=1)
+    return axes / np.linalg.norm(axes, axis=2, keepdims=True)
 
 
-def _rotations(d: Detections, i, j, f, va: np.ndarray, vb: np.ndarray) -> np.ndarray:
-    """R_SN as (3, 3, h) that lays stars va, vb (3, h) on detections i, j at focal lengths f (h,)."""
-    xy = d.xy.T.astype(va.dtype)
-    si, sj = (np.concatenate([xy[:, k], f[None]]) for k in (i, j))
-    si /= np.sqrt((si * si).sum(axis=0))
-    sj /= np.sqrt((sj * sj).sum(axis=0))
-    s1, s2, s3 = _frame(si, sj)
-    n1, n2, n3 = _frame(va, vb)
-    return s1[:, None] * n1[None] + s2[:, None] * n2[None] + s3[:, None] * n3[None]
+def rotations(d: Detections, i, j, f, va: np.ndarray, vb: np.ndarray) -> np.ndarray:
+    """R_SN (h, 3, 3) that lay stars va, vb (h, 3) on detections i, j at focal lengths f (h,)."""
+    s = [np.concatenate([d.xy[k], f[:, None]], axis=1) for k in (i, j)]
+    si, sj = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in s)
+    return np.matmul(_axes(si, sj).transpose(0, 2, 1), _axes(va, vb))
+
+
+def _laid(d: Detections, i, j, f: np.ndarray, va: np.ndarray, vb: np.ndarray) -> np.ndarray:
+    """M (3, h, 3): detection t of `_coordinates` is seen, under each hypothesis, along M @ T[:, t] in N.
+
+    With p = (x, y, f), any p_t = A p_i + B p_j + C p_i x p_j, and stars v_a, v_b lie along p_i, p_j: no rotation is needed.
+    A and B are a_t and 1 - a_t plus multiples of e_t, C is a multiple of e_t, where a_t and e_t are place along and distance
+    from the line through i and j, which f does not change.
+    """
+    x, y = d.xy.T.astype(np.float32)
+    xi, yi, xj, yj = x.take(i), y.take(i), x.take(j), y.take(j)
+    square = f * f
+    X, Y = va * np.sqrt(xi * xi + yi * yi + square), vb * np.sqrt(xj * xj + yj * yj + square)
+    dx, dy, D = xi - xj, yi - yj, xi * yj - xj * yi
+    length = dx * dx + dy * dy
+    scale = 1.0 / (square * length + D * D)
+    w = (dx * xj + dy * yj) / length
+    D *= scale
+    scale *= f
+    M = np.empty((3, len(f), 3), dtype=np.float32)
+    M[:, :, 0], M[:, :, 1] = X, Y
+    M[0, :, 2] = X[1] * Y[2] - X[2] * Y[1]
+    M[1, :, 2] = X[2] * Y[0] - X[0] * Y[2]
+    M[2, :, 2] = X[0] * Y[1] - X[1] * Y[0]
+    M[:, :, 2] *= scale
+    M[:, :, 2] += (D * w) * X - (D * (1.0 + w)) * Y
+    return M
+
+
+def _coordinates(d: Detections, i: np.ndarray, j: np.ndarray, tests: np.ndarray) -> np.ndarray:
+    """T (m, 3, t): a, 1 - a and e (see `_laid`) of the detections `tests` for pairs i, j (m,)."""
+    xi, xj = d.xy[i], d.xy[j]
+    u = xi - xj
+    t = d.xy[tests]
+    a = ((t[None] - xj[:, None]) * u[:, None]).sum(axis=2) / (u * u).sum(axis=1, keepdims=True)
+    e = t[None, :, 0] * u[:, None, 1] - t[None, :, 1] * u[:, None, 0] + (xi[:, :1] * xj[:, 1:] - xj[:, :1] * xi[:, 1:])
+    return np.stack([a, 1.0 - a, e], axis=1).astype(np.float32)
 
 
 def _rank(level: Level, d: Detections, i, j, a, b, zero, freedom: Freedom, keep: int) -> Hypotheses | None:
@@ -190,21 +272,18 @@ def _rank(level: Level, d: Detections, i, j, a, b, zero, freedom: Freedom, keep:
         zero = None if zero is None else zero[good]
     else:
         f = np.full(len(i), freedom.f_known)
-    fs = f.astype(np.float32)
-    R = _rotations(d, i, j, fs, va, vb)
-    R[2] *= fs
+    M = _laid(d, i, j, f.astype(np.float32), va, vb)
     sky_map = level.sky_map(FAINT, tolerance_px(d, freedom) / float(np.median(f)))
     # The first test takes bright and faint ones alike: the brightest few may all be false.
     tests = np.concatenate([np.arange(k, len(d), 3) for k in range(3)]).astype(int)
-    first, kept = (FIRST_TEST, FIRST_KEPT) if len(f) < FEW else (2 * FIRST_TEST, max(FIRST_KEPT, len(f) // 20))
-    score = _score(sky_map, d, R, zero, tests[:first])
-    best = _largest(score, max(kept, keep))
-    if len(d) > first:
-        more = _score(sky_map, d, R[:, :, best], None if zero is None else zero[best], tests[first:])
-        score[best] += more
+    score = 2.0 + _score(sky_map, d, M, i, j, zero, tests[:FIRST_TEST])
+    best = np.sort(_largest(score, max(FIRST_KEPT, keep, int(FIRST_SHARE * len(f)))))
+    if len(d) > FIRST_TEST:
+        some = None if zero is None else zero[best]
+        score[best] += _score(sky_map, d, M[:, best], i[best], j[best], some, tests[FIRST_TEST:])
     best = best[_largest(score[best], keep)]
-    va, vb = (level.directions[k[best]].T for k in (a, b))
-    return Hypotheses(_rotations(d, i[best], j[best], f[best], va, vb).transpose(2, 0, 1), f[best], score[best])
+    va, vb = (level.directions[k[best]] for k in (a, b))
+    return Hypotheses(rotations(d, i[best], j[best], f[best], va, vb), f[best], score[best])
 
 
 def _largest(score: np.ndarray, keep: int) -> np.ndarray:
@@ -217,23 +296,45 @@ def _largest(score: np.ndarray, keep: int) -> np.ndarray:
     return np.argsort(-score, kind="stable")
 
 
-def _score(sky_map: SkyMap, d: Detections, R: np.ndarray, zero: np.ndarray | None, tests: np.ndarray) -> np.ndarray:
-    """Weighed hits (h,) of the detections `tests`; R (3, 3, h) with its last row times f."""
-    P = np.ones((3, len(tests)), dtype=np.float32)
-    P[:2] = d.xy[tests].T
-    v = [R[:, k].T @ P for k in range(3)]
-    found = sky_map.cells.take(sky_map.index(*v))
-    if zero is None or d.magnitude is None:
-        return (found != EMPTY).sum(axis=1).astype(np.float32)
-    # Empty cells look up a star so faint that its weight is nothing.
-    z = MAGNITUDES.take(found)
-    z -= d.magnitude[tests].astype(np.float32)
-    z -= zero[:, None]
-    z *= np.float32(0.45 / np.hypot(1.3 * d.magnitude_sigma, 0.05))
-    z *= z
-    z *= z
-    z += np.float32(1.0)
-    return np.reciprocal(z, out=z).sum(axis=1)
+def _score(
+    sky_map: SkyMap, d: Detections, M: np.ndarray, i, j, zero: np.ndarray | None, tests: np.ndarray
+) -> np.ndarray:
+    """Weighed hits (h,) of the detections `tests` other than i and j, under the hypotheses M (3, h, 3) of `_laid`.
+
+    Runs of hypotheses share their pair of detections: they are one matrix product.
+    """
+    h, t = len(i), len(tests)
+    run = np.concatenate([[0], np.flatnonzero((np.diff(i) != 0) | (np.diff(j) != 0)) + 1, [h]])
+    T = _coordinates(d, i[run[:-1]], j[run[:-1]], tests)
+    place = np.full(len(d), -1)
+    place[tests] = np.arange(t)
+    score = np.empty(h, dtype=np.float32)
+    v = np.empty((3, min(h, BLOCK), t), dtype=np.float32)
+    m = None if d.magnitude is None else d.magnitude[tests].astype(np.float32)
+    for begin in range(0, h, BLOCK):
+        end = min(begin + BLOCK, h)
+        r0, r1 = np.searchsorted(run, [begin, end - 1], side="right")
+        own = []
+        for r in range(int(r0) - 1, int(r1)):
+            p, q = max(int(run[r]), begin), min(int(run[r + 1]), end)
+            np.matmul(M[:, p:q], T[r], out=v[:, p - begin : q - begin])
+            own += [(p - begin, q - begin, place[k]) for k in (i[p], j[p]) if place[k] >= 0]
+        found = sky_map.cells.take(sky_map.index(v[0, : end - begin], v[1, : end - begin], v[2, : end - begin]))
+        for p, q, column in own:
+            found[p:q, column] = EMPTY
+        if zero is None or m is None:
+            score[begin:end] = np.count_nonzero(found != EMPTY, axis=1)
+            continue
+        # Empty cells look up a star so faint that its weight is nothing.
+        z = MAGNITUDES.take(found)
+        z -= m
+        z -= zero[begin:end, None]
+        z *= np.float32(0.45 / np.hypot(1.3 * d.magnitude_sigma, 0.05))
+        z *= z
+        z *= z
+        z += np.float32(1.0)
+        score[begin:end] = np.reciprocal(z, out=z).sum(axis=1)
+    return score
 
 
 def levels_for(d: Detections, freedom: Freedom, ladder: tuple[float, ...]) -> list[tuple[int, Freedom]]:
@@ -254,4 +355,4 @@ def levels_for(d: Detections, freedom: Freedom, ladder: tuple[float, ...]) -> li
     return out
 
 
-__all__ = ["Hypotheses", "detection_pairs", "hypotheses", "levels_for"]
+__all__ = ["Hypotheses", "Stage", "detection_pairs", "hypotheses", "levels_for"]

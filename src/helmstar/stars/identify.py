@@ -10,10 +10,11 @@ import numpy as np
 
 from ..attitude import quaternion_of_matrix
 from .catalog import load_catalog
-from .hypotheses import detection_pairs, hypotheses, levels_for
+from .hypotheses import CHUNK, FIRST_CHUNK, Hypotheses, Stage, detection_pairs, levels_for
 from .patterns import BRIGHT, BRIGHTEST, FAINT, LADDER, Sky
 from .pinhole import Camera, ideal_pixels
-from .verify import Detections, Fit, Freedom, jacobian, probability_false, turn, verify
+from .screen import Raster, raster, screen
+from .verify import HOPELESS, Detections, Fit, Freedom, jacobian, probability_false, turn, verify
 
 Status = Literal["solved", "too few stars", "no match", "uncertain"]
 
@@ -23,10 +24,14 @@ FEWEST = 3
 """Stars that a solution must match; with a known zero point of magnitudes 2 may do."""
 LIMIT = 1e-6
 """Default of the largest probability that a solution is false."""
-AT_ONCE, KEPT, POOL = 2, 20, 300
-"""Hypotheses of each chunk that are verified at once, that are kept, and that are verified when a table is exhausted."""
-WORK = 3_000_000
-"""Catalogue pairs that are looked at before the search gives up."""
+KEPT = 5
+"""Hypotheses of each chunk that are screened."""
+DEPTHS = ((BRIGHTEST, 1.0), (BRIGHT, 1.0), (FAINT, 0.15))
+"""Pair tables with how probable it is that they lead to a solution which the others miss. The first is for unknown fields."""
+WORTH = tuple(4e-8 * 2.0**k for k in range(8, -1, -1))
+"""Solutions that a look at one more catalogue pair must promise, from first to last (`hypotheses.Stage`)."""
+WORK = 2_500_000
+"""Catalogue pairs that are looked at before the search gives up, whatever the next one promises."""
 
 
 @dataclass(frozen=True)
@@ -211,52 +216,43 @@ def focal_freedom(camera: Camera, fov_range: tuple[float, float] | None, focal_s
 def search(sky: Sky, d: Detections, freedom: Freedom, fewest: int, limit: float, work: int) -> tuple[list[Fit], int]:
     """Distinct fits found, and the catalogue pairs looked at; stops at the first that is convincing.
 
-    Of each chunk of hypotheses the best few are verified at once. The next best wait in a pool, which is verified, best first,
-    when a table is exhausted: most searches end long before.
+    What promises most per catalogue pair comes first, and the search ends when nothing is worth it any more.
     """
     enough = min(limit, LIMIT)
     fits: list[Fit] = []
     done = 0
     levels = levels_for(d, freedom, LADDER)
-    at_first, later = detection_pairs(d), detection_pairs(d, later=True)
-    stages = [(BRIGHT, at_first), (BRIGHT, later), (FAINT, at_first)]
-    if freedom.free:
-        stages = [(BRIGHTEST, at_first), *stages]
-    block = 3 if freedom.free else 10_000
-    for n, pairs in stages:
-        pool: list[tuple[float, int, np.ndarray, float]] = []
-        for begin in range(0, len(pairs), block):
-            for k, part in levels:
-                for looked, found in hypotheses(sky.level(k), n, d, pairs[begin : begin + block], part, KEPT):
-                    done += looked
-                    if found is None:
-                        continue
-                    ranked = [
-                        (float(s), k, R, float(f)) for R, f, s in zip(found.R, found.f, found.score) if s > fewest - 0.5
-                    ]
-                    if try_all(sky, d, ranked[:AT_ONCE], freedom, fits, fewest, enough):
-                        return fits, done
-                    pool += ranked[AT_ONCE:]
-                    if done > work:
-                        break
+    pairs = detection_pairs(d)
+    stages = [Stage(sky, n, d, pairs, levels, prior) for n, prior in DEPTHS if freedom.free or n != BRIGHTEST]
+    cells = raster(d)
+    for worth in WORTH:
+        for stage in stages:
+            for k, looked, found in stage.hypotheses(worth, KEPT, min(max(done, FIRST_CHUNK), CHUNK)):
+                done += looked
+                if found is not None and weigh(sky, k, d, cells, found, freedom, fits, fewest, enough):
+                    return fits, done
                 if done > work:
-                    break
-            if done > work:
-                break
-        pool.sort(key=lambda entry: -entry[0])
-        if try_all(sky, d, pool[:POOL], freedom, fits, fewest, enough) or done > work:
-            break
+                    return fits, done
     return fits, done
 
 
-def try_all(sky: Sky, d: Detections, ranked, freedom: Freedom, fits: list[Fit], fewest: int, limit: float) -> bool:
-    """Verify hypotheses (score, level, R, f) and add the fits to the list; True once one is convincing."""
+def weigh(
+    sky: Sky, level: int, d: Detections, cells: Raster, found: Hypotheses, freedom: Freedom, fits: list[Fit], fewest: int,
+    limit: float,
+) -> bool:  # fmt: skip
+    """Screen hypotheses, verify what remains, the best first, and add the fits to the list; True once one is convincing."""
+    n = int((found.score > fewest - 0.5).sum())
+    if n == 0:
+        return False
+    odds, R, f = screen(sky, level, d, cells, found.R[:n], found.f[:n], freedom)
     closest = 2.0 * d.typical_sigma
-    for _, k, R, f in ranked:
+    for k in np.argsort(-odds):
+        if odds[k] < HOPELESS:
+            break
         # A hypothesis on top of a fit would lead there again. Not so one nearby: a short pair may have led to a poor fit.
-        if any(same(R, f, fit, closest / f, 1e-3) for fit in fits):
+        if any(same(R[k], f[k], fit, closest / f[k], 1e-3) for fit in fits):
             continue
-        fit = verify(sky, k, d, R, f, freedom)
+        fit = verify(sky, level, d, R[k], float(f[k]), freedom, first_gate=2.5, rounds=2)
         if fit is None or len(fit.stars) < fewest:
             continue
         add(fits, fit)

@@ -17,7 +17,9 @@ expected in the image matched, residuals r_j (px), detections of density lam (1/
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -61,11 +63,16 @@ class Detections:
     high: np.ndarray
     order: np.ndarray
 
-    @property
+    @cached_property
     def area(self) -> float:
         return float(np.prod(self.high - self.low))
 
-    @property
+    @cached_property
+    def density(self) -> float:
+        """Of false detections, 1/px^2. It cannot be read from a list that is all true: at least one per image, on top."""
+        return (len(self.xy) + 1.0) / self.area
+
+    @cached_property
     def typical_sigma(self) -> float:
         return middle(self.sigma)
 
@@ -123,14 +130,34 @@ def turn(theta: np.ndarray, R: np.ndarray) -> np.ndarray:
     return R + (a * K + b * (K @ K)) @ R
 
 
-def expected_stars(sky: Sky, level: int, R: np.ndarray, f: float, d: Detections, limit: int) -> np.ndarray:
-    """Catalogue indices, brightest first, of what may be in the image or just beyond its edge: about `limit` at most."""
+def turns(theta: np.ndarray) -> np.ndarray:
+    """exp([theta x]) (h, 3, 3) of theta (h, 3)."""
+    t = np.sqrt((theta**2).sum(axis=1))
+    K = np.zeros((len(t), 3, 3))
+    K[:, 0, 1], K[:, 0, 2], K[:, 1, 2] = -theta[:, 2], theta[:, 1], -theta[:, 0]
+    K -= K.transpose(0, 2, 1)
+    a, b = np.sinc(t / np.pi), 0.5 * np.sinc(0.5 * t / np.pi) ** 2
+    return np.eye(3) + a[:, None, None] * K + b[:, None, None] * np.matmul(K, K)
+
+
+def deepest(d: Detections) -> int:
+    """Most stars that a list of detections is compared with."""
+    return int(min(220, max(60, 3 * len(d))))
+
+
+def stars_near(sky: Sky, level: int, R: np.ndarray, f: float, d: Detections) -> np.ndarray:
+    """Catalogue indices, brightest first, of a circle around the image, at one attitude."""
     middle = 0.5 * (d.low + d.high)
     axis = R.T @ np.array([middle[0], middle[1], f])
     half = 0.5 * (d.high - d.low)
-    stars = sky.near(level, axis / np.sqrt(axis @ axis), 1.03 * float(np.arctan(np.sqrt(half @ half) / f)))
+    return sky.near(level, axis / np.sqrt(axis @ axis), 1.03 * float(np.arctan(np.sqrt(half @ half) / f)))
+
+
+def expected_stars(sky: Sky, level: int, R: np.ndarray, f: float, d: Detections, limit: int) -> np.ndarray:
+    """Catalogue indices, brightest first, of what may be in the image or just beyond its edge: about `limit` at most."""
+    stars = stars_near(sky, level, R, f, d)
     p, front = project(sky.directions.take(stars, axis=0), R, f)
-    margin = 0.1 * half
+    margin = 0.05 * (d.high - d.low)
     return stars[front & inside(p, d.low - margin, d.high + margin)][: limit + limit // 2]
 
 
@@ -181,27 +208,35 @@ def step(u, residual, sigma, f, freedom: Freedom) -> tuple[np.ndarray, np.ndarra
     return np.linalg.solve(damped, g), information
 
 
-def magnitude_terms(
-    d: Detections, magnitude: np.ndarray, i: np.ndarray, j: np.ndarray
-) -> tuple[np.ndarray, float, float]:
-    """Log likelihood ratio (k,) of the matches' magnitudes, the zero point, and the log of what fitting it costs."""
-    if d.magnitude is None or len(i) == 0:
-        return np.zeros(len(i)), 0.0, 0.0
-    dm = magnitude[i] - d.magnitude[j]
+def zero_point_price(d: Detections, count: int) -> float:
+    """Log of what fitting the zero point to `count` matches costs."""
+    if d.magnitude is None or d.zero_point is not None:
+        return 0.0
+    sigma = 1.25 * d.magnitude_sigma / math.sqrt(count)
+    return math.log(min(1.0, math.sqrt(2.0 * math.pi) * sigma / ZERO_POINT_RANGE))
+
+
+def magnitude_gain(d: Detections, V: np.ndarray, j: np.ndarray, zero: float | np.ndarray) -> np.ndarray:
+    """Log likelihood ratio (k,) of the magnitudes of stars V (k,) matched with detections j (k,), at a zero point."""
+    if d.magnitude is None:
+        return np.zeros(len(j))
     s = d.magnitude_sigma
-    if d.zero_point is None:
-        zero = middle(dm)
-        price = float(np.log(min(1.0, np.sqrt(2.0 * np.pi) * 1.25 * s / np.sqrt(len(dm)) / ZERO_POINT_RANGE)))
-    else:
-        zero, price = d.zero_point, 0.0
-    z = dm - zero
-    density = (1.0 - BROAD_SHARE) / s * np.exp(-0.5 * (z / s) ** 2)
+    square = (V - d.magnitude[j] - zero) ** 2
     broad = min(BROAD_SIGMA, BROAD_FACTOR * s)
-    density += BROAD_SHARE / broad * np.exp(-0.5 * (z / broad) ** 2)
-    return np.log(density / np.sqrt(2.0 * np.pi) + 1e-6) - d.log_magnitude_density[j], zero, price
+    density = (1.0 - BROAD_SHARE) / s * np.exp(-0.5 / s**2 * square) + BROAD_SHARE / broad * np.exp(
+        -0.5 / broad**2 * square
+    )
+    return np.log(density / np.sqrt(2.0 * np.pi) + 1e-6) - d.log_magnitude_density[j]
 
 
-def log_odds(d: Detections, gain: np.ndarray, rank: np.ndarray, expected: int) -> float:
+def zero_point(d: Detections, V: np.ndarray, j: np.ndarray) -> float:
+    """Median of the matches, or what is known."""
+    if d.magnitude is None or len(j) == 0:
+        return 0.0
+    return middle(V - d.magnitude[j]) if d.zero_point is None else d.zero_point
+
+
+def log_odds(gain: np.ndarray, rank: np.ndarray, expected: int) -> float:
     """Of the matches, without the price of the fit: gain (k,) in the order of rank (k,) among the expected stars."""
     depth = np.arange(1, expected + 1)
     k = np.searchsorted(rank, depth, side="left")
@@ -229,7 +264,7 @@ def verify(
     first_gate: of the first round, over GATE sigma, for what the start does not know yet. volume: rad^3, of attitudes that were
     possible before.
     """
-    limit = int(min(220, max(60, 3 * len(d))))
+    limit = deepest(d)
     candidates = expected_stars(sky, level, R, f, d, limit)
     field = _Field(d, freedom, candidates, sky.directions[candidates], sky.magnitude[candidates], limit, volume)
     best = field.settle(R, f, 1.0, first_gate, rounds)
@@ -265,8 +300,6 @@ class _Field:
     def settle(self, R: np.ndarray, f: float, scale: float, first_gate: float, rounds: int) -> Fit | None:
         """Match and step `rounds` times, then match and weigh."""
         d, freedom, zero = self.d, self.freedom, self.d.zero_point
-        # The density of false detections cannot be read from a list that is all true: at least one per image, on top.
-        density = (len(d) + 1.0) / d.area
         for turn_number in range(rounds + 1):
             p, _ = project(self.r, R, f)
             seen = np.flatnonzero(inside(p, d.low, d.high))[: self.limit]
@@ -283,22 +316,23 @@ class _Field:
             sigma = scale * d.sigma[j]
             square = (residual**2).sum(axis=1) / sigma**2
             if turn_number == rounds or (turn_number == 1 and rounds > 2):
-                gain, zero, price = magnitude_terms(d, self.V[seen], i, j)
-                gain = gain - 0.5 * square - np.log(2.0 * np.pi * sigma**2 * density)
+                V = self.V[seen[i]]
+                zero = zero_point(d, V, j)
+                gain = magnitude_gain(d, V, j, zero) - 0.5 * square - np.log(2.0 * np.pi * sigma**2 * d.density)
                 # A match that speaks against the hypothesis is none: the star is missing and the detection false.
                 good = np.flatnonzero(gain > 0.0)
                 if len(good) < 2:
                     return None
                 _, information = step(p[i[good]] / f, residual[good], sigma[good], f, freedom)
-                total = log_odds(d, gain[good], i[good], len(seen)) + price - np.log(scale)
-                total += _log_fit_volume(information, freedom, self.volume)
+                total = log_odds(gain[good], i[good], len(seen)) + zero_point_price(d, len(i)) - np.log(scale)
+                total += float(fit_volumes(information[None], freedom, self.volume)[0])
                 if turn_number == rounds:
                     stars = self.candidates[seen[i[good]]]
                     return Fit(R, f, stars, j[good], residual[good], total, scale, zero, information)
                 if total < HOPELESS:
                     return None
             else:
-                _, zero, _ = magnitude_terms(d, self.V[seen], i, j)
+                zero = zero_point(d, self.V[seen[i]], j)
             # Far residuals of a wide gate are mostly false matches: they pull less.
             soft = sigma * np.sqrt(1.0 + square / (2.0 * widen) ** 2)
             delta, _ = step(p[i] / f, residual, soft, f, freedom)
@@ -307,16 +341,15 @@ class _Field:
         return None
 
 
-def _log_fit_volume(information: np.ndarray, freedom: Freedom, volume: float) -> float:
-    """Log of the volume that the fit leaves over the one it was chosen from."""
+def fit_volumes(information: np.ndarray, freedom: Freedom, volume: float = SO3_VOLUME) -> np.ndarray:
+    """Logs (h,) of the volumes that fits of information (h, 4, 4) leave over the one they were chosen from."""
     if freedom.free:
         volume *= max(float(np.log(freedom.f_high / freedom.f_low)), 1e-3)
     else:  # the Gaussian prior of ln f stands in the information; this is its norm
-        volume *= np.sqrt(2.0 * np.pi) * max(freedom.sigma, 1e-6)
+        volume *= math.sqrt(2.0 * math.pi) * max(freedom.sigma, 1e-6)
     sign, logdet = np.linalg.slogdet(information)
-    if sign <= 0:
-        return -np.inf
-    return float(min(0.0, 0.5 * (4.0 * np.log(2.0 * np.pi) - logdet) - np.log(volume)))
+    price = np.minimum(0.0, 0.5 * (4.0 * math.log(2.0 * math.pi) - logdet) - math.log(volume))
+    return np.where(sign > 0, price, -np.inf)
 
 
 def probability_false(fits: list[Fit]) -> float:
