@@ -67,12 +67,13 @@ def sky_of(array: np.ndarray) -> tuple[float, float]:
     if whole:  # whole numbers stand for intervals; spread evenly in theirs, repeatable
         v = v + np.modf(np.arange(v.size) * 0.6180339887498949)[0] - 0.5
     v.sort()
-    w = v
-    while w.size > 3:
-        half = (w.size + 1) // 2
-        i = int(np.argmin(w[half - 1 :] - w[: w.size - half + 1]))
-        w = w[i : i + half]
-    sky = float(w.mean())
+    sky = _mode(v)
+    # A body that fills the image may be the commonest level: the sky is then a narrow level far below it.
+    for _ in range(4):
+        dark = float(v[v.size // 100])
+        if np.searchsorted(v, dark + 0.2 * (sky - dark)) < 0.08 * v.size:
+            break
+        sky = _mode(v[: max(int(np.searchsorted(v, dark + 0.5 * (sky - dark))), 8)])
     noise = 0.0
     for _ in range(4):
         below = v[v < sky]
@@ -84,6 +85,15 @@ def sky_of(array: np.ndarray) -> tuple[float, float]:
         sky = float(near.mean())
     floor = 0.29 if whole else 1e-6 * max(float(v[-1] - v[0]), 1e-30)
     return sky, max(noise, floor)
+
+
+def _mode(v: np.ndarray) -> float:
+    """The half-sample mode of sorted numbers."""
+    while v.size > 3:
+        half = (v.size + 1) // 2
+        i = int(np.argmin(v[half - 1 :] - v[: v.size - half + 1]))
+        v = v[i : i + half]
+    return float(v.mean())
 
 
 def preprocess(image: Image, sigmas: float = FULL_FRAME_SIGMAS) -> Grey:

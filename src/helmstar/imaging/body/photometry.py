@@ -141,9 +141,10 @@ def law_of(name: str, **parameters: float) -> Law:
 def family(mu0: np.ndarray, mu: np.ndarray) -> list[np.ndarray]:
     """Patterns whose sums come near every law above at one phase: what a fit uses where the law is not known.
 
-    Lambert and Lommel-Seeliger are two of the sums; mu0 mu and mu0^2 bend limb and terminator, and sqrt(mu0) lifts the terminator.
+    Lambert and Lommel-Seeliger are two of the sums; mu0 mu and mu0^2 bend limb and terminator; two of Minnaert's brighten the limb.
     """
-    return [mu0, _seeliger(mu0, mu), mu0 * mu, mu0 * mu0, mu0 * np.sqrt(mu)]
+    fall = np.sqrt(mu0 / np.maximum(mu, 1e-3))
+    return [mu0, _seeliger(mu0, mu), mu0 * mu, mu0 * mu0, fall, np.sqrt(mu0 * fall)]
 
 
 __all__ = [

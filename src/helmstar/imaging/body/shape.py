@@ -110,7 +110,8 @@ class EllipsoidView:
     """An ellipsoid as a camera sees it, ready for many rays.
 
     depth: z of the centre in C, m. centre: (x0, y0) of the centre on the plane z = 1. u0: (3,), A: (3, 2): u = u0 + A [ex, ey].
-    sun: (3,) D R_TC s. inverse_axes: (3,).
+    sun: (3,) B s with B = D R_TC, or D R_TC stretched. across: (3, 3) B^T, whose product with q is normal to the surface, or the
+    one number that all |B^T q| are.
     """
 
     depth: float
@@ -118,17 +119,29 @@ class EllipsoidView:
     u0: np.ndarray
     A: np.ndarray
     sun: np.ndarray
-    inverse_axes: np.ndarray
-    round: bool
+    across: np.ndarray | float
 
     @classmethod
-    def of(cls, shape: Ellipsoid, r_TC_C: np.ndarray, R_TC: np.ndarray, sun_C: np.ndarray) -> EllipsoidView:
-        """r_TC_C: (3,) from camera to body, m, in C, in front of it. R_TC: (3, 3), from C to T. sun_C: (3,) unit, body to Sun."""
+    def of(
+        cls,
+        shape: Ellipsoid,
+        r_TC_C: np.ndarray,
+        R_TC: np.ndarray,
+        sun_C: np.ndarray,
+        stretch: np.ndarray | None = None,
+    ) -> EllipsoidView:
+        """r_TC_C: (3,) from camera to body, m, in C, in front of it. R_TC: (3, 3), from C to T. sun_C: (3,) unit, body to Sun.
+
+        stretch: (3, 3) symmetric S in C; the body is drawn out by I + S.
+        """
         axes = np.array(shape.semi_axes)
         x0, y0 = r_TC_C[0] / r_TC_C[2], r_TC_C[1] / r_TC_C[2]
-        D = R_TC / axes[:, None]
-        is_round = bool(np.ptp(axes) == 0.0)
-        return cls(float(r_TC_C[2]), (x0, y0), D @ np.array([x0, y0, 1.0]), D[:, :2], D @ sun_C, 1.0 / axes, is_round)
+        B = R_TC / axes[:, None]
+        if stretch is not None:
+            B = B @ np.linalg.inv(np.eye(3) + stretch)
+        even = stretch is None and bool(np.ptp(axes) == 0.0)
+        across = 1.0 / float(axes[0]) if even else B.T.copy()
+        return cls(float(r_TC_C[2]), (x0, y0), B @ np.array([x0, y0, 1.0]), B[:, :2], B @ sun_C, across)
 
     def outline(self, ex: np.ndarray, ey: np.ndarray) -> np.ndarray:
         """p.p of rays at offsets (ex, ey) on the plane z = 1 from the centre: 1 on the outline."""
@@ -150,10 +163,11 @@ class EllipsoidView:
         root = np.sqrt(np.maximum(1.0 - pp, 0.0))
         back = root / np.sqrt(uu)
         q = [p_ - back * u_ for p_, u_ in zip(p, u)]
-        if self.round:
-            size: np.ndarray | float = float(self.inverse_axes[0])
+        if isinstance(self.across, float):
+            size: np.ndarray | float = self.across
         else:
-            size = np.sqrt(sum((i * q_) ** 2 for i, q_ in zip(self.inverse_axes, q)))
+            normal = [a * q[0] + b * q[1] + c * q[2] for a, b, c in self.across]
+            size = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
         x, y = ex + self.centre[0], ey + self.centre[1]
         mu = root * np.sqrt(uu / (1.0 + x * x + y * y)) / size
         mu0 = np.maximum(q[0] * self.sun[0] + q[1] * self.sun[1] + q[2] * self.sun[2], 0.0) / size
