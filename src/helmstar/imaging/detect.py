@@ -23,6 +23,9 @@ _BORDER = 2
 _BRIGHT = 15.0
 _MISFIT = 1.5  # chi-square per pixel above which the model, not noise, is what is wrong
 _COARSE = 1.8  # px; optics broader than this need the coarsest level
+_FEW = 6  # stars; fewer do not confirm what is believed of the optics
+_FULL = 9  # px
+_SAME = 0.2  # of the logarithm of the width
 _FOR_WIDTH = 24  # stars whose widths tell the optics
 _WIDTH = (0.8, 1.5, 3.0)  # sigma expected of a star found at each level, px
 
@@ -50,26 +53,152 @@ class DetectionSettings:
             raise ValueError(f"max_stars {self.max_stars}: must be 1 to 10000")
 
 
+@dataclass(frozen=True)
+class Optics:
+    """What one frame tells of the next by the same camera: sigma of the stars along x and y, px."""
+
+    width: tuple[float, float]
+
+    @property
+    def level(self) -> int:
+        """The scale at which such stars show best."""
+        return int(np.argmin(np.abs(np.log(np.array(_WIDTH) ** 2 / np.prod(self.width)))))
+
+
 def detect(image: Image, settings: DetectionSettings | None = None, dark: np.ndarray | None = None) -> Centroids:
     """Stars of an image, the largest flux first, at most `max_stars`. dark: (height, width) subtracted before.
 
     An image smaller than 16 pixels a side, or of one value, has none. Raises ValueError for a dark of another shape.
     """
+    return detect_next(image, settings, dark)[0]
+
+
+def detect_next(
+    image: Image,
+    settings: DetectionSettings | None = None,
+    dark: np.ndarray | None = None,
+    optics: Optics | None = None,
+) -> tuple[Centroids, Optics | None]:
+    """As `detect`, with what the frame before told, and what this one tells: the same call for a sequence takes half the time.
+
+    With optics only their scale is searched. Where its stars are few or of another width, the frame is searched as the first.
+    """
     s = settings or DetectionSettings()
+    array, quantum = _prepared(image, dark)
+    if min(array.shape) < 16:
+        return _nothing(), None
+    if optics is not None and optics.level < s.levels and min(array.shape) >> optics.level >= 40:
+        found = _at_scale(array, image, optics, s, quantum)
+        if found is not None:
+            return found, optics
+    return _at_all_scales(array, image, s, quantum)
+
+
+def detect_near(
+    image: Image, xy_px: np.ndarray, reach_px: float, optics: Optics, settings: DetectionSettings | None = None,
+    dark: np.ndarray | None = None,
+) -> Centroids:  # fmt: skip
+    """Stars within `reach_px` of expected places (n, 2), the brightest one of each, and nothing of the rest of the image."""
+    s = settings or DetectionSettings()
+    if dark is not None and dark.shape != image.array.shape:
+        raise ValueError(f"dark of shape {dark.shape}: the image has {image.array.shape}")
+    height, width = image.array.shape
+    inside = (xy_px >= 0).all(axis=1) & (xy_px[:, 0] < width) & (xy_px[:, 1] < height)
+    at = np.rint(xy_px[inside]).astype(int)
+    if not len(at) or min(height, width) < 16:
+        return _nothing()
+    level = optics.level
+    reach, quantum = int(np.ceil(reach_px)), _quantum(image)
+    around = reach + 2 + (3 << level)
+    w = _around(image.array, at[:, 0], at[:, 1], around)
+    if dark is not None:
+        w -= _around(dark, at[:, 0], at[:, 1], around)
+    ordered = np.sort(w.reshape(len(w), -1)[:, ::3], axis=1)
+    count = ordered.shape[1]
+    sky = ordered[:, count // 2]
+    noise = np.maximum(ordered[:, int(0.8413 * count)] - sky, quantum / np.sqrt(12.0))
+    f = w
+    for _ in range(1 << level):  # [1 2 1] both ways, wider for wider optics
+        f = f[:, :-2] + 2 * f[:, 1:-1] + f[:, 2:]
+        f = (f[:, :, :-2] + 2 * f[:, :, 1:-1] + f[:, :, 2:]) / 16.0
+    edge = (f.shape[1] - (2 * reach + 1)) // 2
+    f = f[:, edge : edge + 2 * reach + 1, edge : edge + 2 * reach + 1]
+    j, i = np.divmod(f.reshape(len(f), -1).argmax(axis=1), 2 * reach + 1)
+    excess = f[np.arange(len(f)), j, i] - sky
+    filtered = noise * (0.375, 0.2, 0.13)[level]  # sigma of the mean under those weights
+    x, y = at[:, 0] + i - reach, at[:, 1] + j - reach
+    good = (excess > s.threshold * filtered) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    _, first = np.unique(y[good] * width + x[good], return_index=True)
+    keep = np.flatnonzero(good)[first]
+    if not keep.size:
+        return _nothing()
+    array = image.array
+    if dark is not None:  # only the windows matter, but they are read from one array
+        array = array.astype(np.float32) - dark
+    snr = excess[keep] / filtered[keep]
+    order = np.argsort(-snr, kind="stable")
+    keep, snr = keep[order], snr[order]
+    return _sorted(
+        [_measure(array, image, x[keep], y[keep], snr, noise[keep], level, np.array(optics.width), s, quantum)], s
+    )
+
+
+def _quantum(image: Image) -> float:
+    return 1.0 if image.array.dtype.kind == "u" else 1e-12
+
+
+def _prepared(image: Image, dark: np.ndarray | None) -> tuple[np.ndarray, float]:
+    """Pixels, finite and without the dark, and the step of their numbers. Raises ValueError for a dark of another shape."""
     array = image.array
     if dark is not None:
         if dark.shape != array.shape:
             raise ValueError(f"dark of shape {dark.shape}: the image has {array.shape}")
         array = array.astype(np.float32) - dark.astype(np.float32)
-    if min(array.shape) < 16:
-        return _nothing()
     if array.dtype != np.uint8:
         array = array.astype(np.float32)
         if not np.isfinite(array.sum()):  # numbers without value shine nowhere
             finite = np.isfinite(array)
             array = np.where(finite, array, np.median(array[finite]) if finite.any() else 0.0).astype(np.float32)
-    quantum = 1.0 if image.array.dtype.kind == "u" else 0.0
-    quantum = max(quantum, 1e-12)
+    return array, _quantum(image)
+
+
+def _at_scale(
+    array: np.ndarray, image: Image, optics: Optics, s: DetectionSettings, quantum: float
+) -> Centroids | None:
+    """Stars at the scale of known optics; None where they do not look like it."""
+    level, binned = optics.level, array
+    for _ in range(level):
+        binned = halve(binned)
+    x, y, _, snr, floor = _merged([_candidates(array, binned, level, s, quantum)], s)
+    if len(x) < _FEW:
+        return None
+    width, full = np.array(optics.width), array[y, x] >= 0.98 * image.saturation
+    if full.any():  # a few full pixels are filled by the fit; many need a window as wide as the light reaches
+        light = _around(array, x[full], y[full], HALF[level]) >= 0.98 * image.saturation
+        full[full] = light.sum(axis=(1, 2)) > _FULL
+    parts, widths = [], []
+    for k, mine in ((level, ~full), (min(level + 1, 2), full)):
+        if mine.any():
+            parts.append(_measure(array, image, x[mine], y[mine], snr[mine], floor[mine], k, width, s, quantum, widths))
+    if not len(parts[0]) or sum(map(len, parts)) < _FEW:
+        return None
+    bright = parts[0].snr > _BRIGHT
+    if bright.any() and not (np.abs(np.log(np.median(widths[0][bright], axis=0) / width)) < _SAME).all():
+        return None
+    return _sorted(parts, s)
+
+
+def _sorted(parts: list[Centroids], s: DetectionSettings) -> Centroids:
+    """All parts, the largest flux first, each star once."""
+    whole = Centroids(**{f: np.concatenate([getattr(p, f) for p in parts]) for f in vars(parts[0])})
+    whole = whole.take(np.argsort(-whole.flux, kind="stable"))
+    return whole.take(_alone(whole)[: s.max_stars])
+
+
+def _at_all_scales(
+    array: np.ndarray, image: Image, s: DetectionSettings, quantum: float
+) -> tuple[Centroids, Optics | None]:
+    """Stars, and the optics where enough of them tell."""
     found: list[tuple[np.ndarray, ...]] = []
     width: np.ndarray | None = None
     binned = array
@@ -88,13 +217,14 @@ def detect(image: Image, settings: DetectionSettings | None = None, dark: np.nda
         if k + 1 < s.levels:
             binned = halve(binned)
     if not found:
-        return _nothing()
+        return _nothing(), None
     x, y, level, snr, floor = places or _merged(found, s)
     if not len(x):
-        return _nothing()
-    if width is not None:
+        return _nothing(), None
+    optics = None if width is None else Optics((float(width[0]), float(width[1])))
+    if optics is not None:
         # A faint star shows best at the scale of the optics: what only a coarser one sees is structure, unless it is bright.
-        best = int(np.argmin(np.abs(np.log(np.array(_WIDTH) ** 2 / width.prod()))))
+        best = optics.level
         keep = (level <= best) | (snr > _BRIGHT)
         x, y, level, snr, floor = (c[keep] for c in (x, y, level, snr, floor))
         # A window as wide as the optics need; a wider one only for what is full, whose light reaches farther.
@@ -105,9 +235,7 @@ def detect(image: Image, settings: DetectionSettings | None = None, dark: np.nda
         mine = np.flatnonzero(level == k)
         if mine.size:
             parts.append(_measure(array, image, x[mine], y[mine], snr[mine], floor[mine], k, width, s, quantum))
-    whole = Centroids(**{f: np.concatenate([getattr(p, f) for p in parts]) for f in vars(parts[0])})
-    whole = whole.take(np.argsort(-whole.flux, kind="stable"))
-    return whole.take(_alone(whole)[: s.max_stars])
+    return (_sorted(parts, s) if parts else _nothing()), optics
 
 
 def dark_of(images: Sequence[Image]) -> np.ndarray:
@@ -299,9 +427,9 @@ def _in_structure(w: _Windows, half: int) -> np.ndarray:
 
 def _measure(
     array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, snr: np.ndarray, floor: np.ndarray, level: int,
-    width: np.ndarray | None, s: DetectionSettings, quantum: float,
+    width: np.ndarray | None, s: DetectionSettings, quantum: float, widths: list[np.ndarray] | None = None,
 ) -> Centroids:  # fmt: skip
-    """Fit the places of one level and keep those that are stars."""
+    """Fit the places of one level and keep those that are stars. widths: gets the fitted sigmas (n, 2) of these."""
     half = HALF[level]
     rounding = quantum / np.sqrt(12.0)
     w = _windows(array, image, x, y, half, np.minimum(floor, rounding))
@@ -324,6 +452,8 @@ def _measure(
     position[saturated] += 0.1**2 * np.eye(2)
     noise, above = w.noise, w.above
     star = _is_star(f, noise, half, s)
+    if widths is not None:
+        widths.append(f.sigma[star])
     peak = above.max(axis=(1, 2))
     everything = Centroids(
         x_px=x + f.x, y_px=y + f.y, flux=f.flux, covariance_px=position, peak=peak, saturated=saturated,
@@ -368,4 +498,4 @@ def _alone(stars: Centroids) -> np.ndarray:
     return np.flatnonzero(~np.any(same & brighter, axis=1))
 
 
-__all__ = ["HALF", "DetectionSettings", "dark_of", "detect"]
+__all__ = ["HALF", "DetectionSettings", "Optics", "dark_of", "detect", "detect_near", "detect_next"]

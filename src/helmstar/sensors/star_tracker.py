@@ -19,19 +19,22 @@ from functools import cache
 
 import numpy as np
 
-from ..imaging import Camera, Centroids, DetectionSettings, Image, detect
+from ..imaging import Camera, Centroids, DetectionSettings, Image
 from ..imaging.calibrated import Calibrated
+from ..imaging.detect import Optics, detect_near, detect_next
 from ..stars.catalog import Catalog, load_catalog
-from ..stars.identify import LIMIT, Identification, identify, matrix_of_quaternion
+from ..stars.identify import LIMIT, Identification, identify, matrix_of_quaternion, unit_quaternion
 from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
-from ..stars.track import track
+from ..stars.track import WIDEST_PX, track
 from .refine import EPOCH_SPREAD_YEARS, LensPrior, refine
 
 FOCAL_SIGMA = 0.005
 """1 sigma, relative, of a focal length that stands for a stated field of view."""
 CALIBRATED_SIGMA = 0.0005
 """The same of a calibrated camera."""
+TRACKED = 50
+"""Stars whose windows are looked at in tracking."""
 AU_DAY = 149597870700.0 / 86400.0
 LIGHT = 299792458.0
 
@@ -62,6 +65,15 @@ class StarSolution:
     def solved(self) -> bool:
         """Whether there is an attitude."""
         return self.identification.solved
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What a frame tells of the next: its size (width, height), the optics, and the camera as fitted, where it was solved."""
+
+    size: tuple[int, int]
+    optics: Optics | None
+    camera: Camera | None
 
 
 class StarTracker:
@@ -97,6 +109,7 @@ class StarTracker:
         self.epoch_years = EPOCH_SPREAD_YEARS if julian_year is None else 0.0
         julian_year = 2000.0 if julian_year is None else julian_year
         self.q_SB, self.limit = q_SB, limit
+        self.memory: Memory | None = None
         self.detection = detection or DetectionSettings()
         if catalog is None:
             self.sky = _sky(julian_year, _plain(velocity_c), _plain(position_au))
@@ -106,7 +119,7 @@ class StarTracker:
     def with_camera(self, known: Calibrated) -> StarTracker:
         """The same with another camera."""
         other = copy(self)
-        other.known, other.camera, other.fov_deg = known, known.camera, None
+        other.known, other.camera, other.fov_deg, other.memory = known, known.camera, None, None
         return other
 
     def solve(
@@ -115,19 +128,52 @@ class StarTracker:
         """Detect, identify and solve for the attitude: without a prior, or tracking from prior_q_SN (4,), good to prior_sigma
         (rad, per axis), with the whole sky as what remains where that fails. The solution does not contain the prior.
 
+        Of the frame before, `memory` keeps the width of the stars and the camera that was found: detection then searches one scale
+        only and, with a prior, only where the brightest stars are expected. Set it to None to forget.
+
         Raises ValueError for an image of another size than the camera's, and for a prior that means nothing.
         """
         begin = time.perf_counter()
-        centroids = detect(image, self.detection, None if self.known is None else self.known.dark)
-        detected = time.perf_counter()
-        ms = {"detect": 1e3 * (detected - begin)}
-        return self.identified(centroids, image.width, image.height, prior_q_SN, prior_sigma, ms)
+        size, dark = (image.width, image.height), None if self.known is None else self.known.dark
+        last = self.memory if self.memory is not None and self.memory.size == size else None
+        if prior_q_SN is not None and prior_sigma is not None and last is not None and last.optics is not None:
+            centroids = self._in_windows(image, prior_q_SN, prior_sigma, last, dark)
+            if centroids is not None:
+                ms = {"detect": 1e3 * (time.perf_counter() - begin)}
+                found = self.identified(centroids, *size, prior_q_SN, prior_sigma, ms, fall_back=False)
+                if found.solved:
+                    self.memory = replace(last, camera=found.camera)
+                    return found
+        centroids, optics = detect_next(image, self.detection, dark, None if last is None else last.optics)
+        ms = {"detect": 1e3 * (time.perf_counter() - begin)}
+        found = self.identified(centroids, *size, prior_q_SN, prior_sigma, ms)
+        self.memory = Memory(size, optics, found.camera if found.solved else None)
+        return found
+
+    def _in_windows(
+        self, image: Image, prior_q_SN: np.ndarray, prior_sigma: float, last: Memory, dark: np.ndarray | None
+    ) -> Centroids | None:
+        """What is seen where the prior has the brightest stars; None where the windows would be too wide or too few."""
+        camera = last.camera or self.camera
+        if camera is None or last.optics is None:
+            return None
+        q = unit_quaternion("prior_q_SN", prior_q_SN)
+        reach = 3.6 * prior_sigma * camera.focal_px + 2.0
+        if not reach <= WIDEST_PX:
+            return None
+        R = matrix_of_quaternion(q)
+        radius = 0.5 * math.hypot(camera.width, camera.height * camera.aspect) / camera.focal_px
+        near = np.flatnonzero(self.sky.directions @ R[2] > math.cos(math.atan(radius)))  # the brightest first
+        xy = camera.pixels(self.sky.directions[near[: 2 * TRACKED]] @ R.T)
+        xy = xy[camera.inside(xy)][:TRACKED]
+        return detect_near(image, xy, reach, last.optics, self.detection, dark) if len(xy) >= 4 else None
 
     def identified(
         self, centroids: Centroids, width: int, height: int, prior_q_SN: np.ndarray | None = None,
-        prior_sigma: float | None = None, ms: dict[str, float] | None = None,
+        prior_sigma: float | None = None, ms: dict[str, float] | None = None, fall_back: bool = True,
     ) -> StarSolution:  # fmt: skip
-        """As `solve`, from the stars that were detected. ms: milliseconds of what went before."""
+        """As `solve`, from the stars that were detected. ms: milliseconds of what went before; fall_back: whether the whole sky is
+        searched where tracking fails."""
         begin = time.perf_counter()
         centroids = self._honest(centroids)
         camera, fov_range, focal_sigma = self._optics(width, height)
@@ -140,6 +186,7 @@ class StarTracker:
             found = track(
                 centroids.xy_px + 0.5, eye, prior_q_SN, prior_sigma, flux=centroids.flux,
                 sigma_px=centroids.covariance_px, focal_sigma=focal_sigma, q_SB=self.q_SB, sky=self.sky, limit=self.limit,
+                fall_back=fall_back,
             )  # fmt: skip
         else:
             found = identify(
