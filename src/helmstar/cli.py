@@ -293,9 +293,12 @@ def _run(args: argparse.Namespace) -> int:
     if args.batch is not None and args.batch < 1:
         raise ConfigurationError(f"--batch {args.batch}: must be at least 1")
     _say(f"{name}: {spec.runs} runs, seed {spec.seed}")
+    if spec.note:
+        _say(spec.note)
     from .campaign import run_campaign
+    from .campaign.runner import default_workers
 
-    experiment = build(name, spec)
+    experiment = build(name, spec, args.workers or default_workers())
     folder = Path(args.out or Path("helmstar-out") / f"{name}-{spec.seed}")
     outcome = run_campaign(
         experiment,

@@ -32,6 +32,16 @@ class ScenarioSpecification(BaseModel):
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)]
     width: Annotated[int, Field(ge=2, le=4096)]
 
+    @classmethod
+    def adapted(cls, content: Mapping[str, Any], stated: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The content of a file and of `--set`, with defaults that depend on it; `stated`: what the user said himself."""
+        return content
+
+    @property
+    def note(self) -> str:
+        """What the user should know before it starts; empty for nothing."""
+        return ""
+
 
 def library() -> dict[str, str]:
     """The built-in scenarios: name -> TOML text."""
@@ -95,11 +105,11 @@ def _nested(dotted: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _content(scenario: str) -> tuple[str, str, dict[str, Any]]:
-    """Name, source for messages, and content of a library scenario or of a user's file."""
+def _content(scenario: str) -> tuple[str, str, dict[str, Any], dict[str, Any]]:
+    """Name, source for messages, and content of a library scenario or of a user's file; and what of it is the user's."""
     built_in = library()
     if scenario in built_in:
-        return scenario, f"scenario {scenario}", tomllib.loads(built_in[scenario])
+        return scenario, f"scenario {scenario}", tomllib.loads(built_in[scenario]), {}
     path = Path(scenario)
     if path.suffix != ".toml" and not path.exists():
         names = ", ".join(built_in)
@@ -111,7 +121,7 @@ def _content(scenario: str) -> tuple[str, str, dict[str, Any]]:
         raise ConfigurationError(
             f"{path}: experiment = {given} is not allowed: must be one of {', '.join(map(repr, built_in))}"
         )
-    return path.stem, str(path), merge(tomllib.loads(built_in[experiment]), content)
+    return path.stem, str(path), merge(tomllib.loads(built_in[experiment]), content), content
 
 
 def validate(model: type[BaseModel], content: Mapping[str, Any], source: str) -> Any:
@@ -127,15 +137,16 @@ def load(scenario: str, overrides: Mapping[str, Any] | None = None) -> tuple[str
 
     Raises ConfigurationError for an unknown scenario, key or value.
     """
-    name, source, content = _content(scenario)
-    model = specification_of(content["experiment"])
+    name, source, content, stated = _content(scenario)
+    model: type[ScenarioSpecification] = specification_of(content["experiment"])
     validate(model, content, source)
     if overrides:
-        return name, validate(model, merge(content, _nested(overrides)), "--set")
-    return name, validate(model, content, source)
+        given = _nested(overrides)
+        content, stated, source = merge(content, given), merge(stated, given), "--set"
+    return name, validate(model, model.adapted(content, stated), source)
 
 
-def specification_of(experiment: str) -> type[BaseModel]:
+def specification_of(experiment: str) -> type[ScenarioSpecification]:
     """The pydantic model of an experiment. This is the one list of experiments beside `build`."""
     if experiment == "xu2020":
         from .xu2020_specification import Specification
@@ -145,17 +156,25 @@ def specification_of(experiment: str) -> type[BaseModel]:
         from .zhou2021_specification import Specification
 
         return Specification
+    if experiment == "li2007":
+        from .li2007_specification import Specification
+
+        return Specification
     raise ConfigurationError(f"experiment {experiment!r}: must be one of {', '.join(library())}")
 
 
-def build(name: str, specification: Any) -> Any:
-    """The experiment of a specification, ready to run (this loads JAX)."""
+def build(name: str, specification: Any, workers: int = 1) -> Any:
+    """The experiment of a specification, ready to run (this loads JAX); workers: processes where it takes star images."""
     if specification.experiment == "xu2020":
         from .xu2020 import Experiment
 
-        return Experiment(specification, name)
+        return Experiment(specification, name, workers)
     if specification.experiment == "zhou2021":
         from .zhou2021 import Experiment
+
+        return Experiment(specification, name)
+    if specification.experiment == "li2007":
+        from .li2007 import Experiment
 
         return Experiment(specification, name)
     raise ConfigurationError(f"experiment {specification.experiment!r}: must be one of {', '.join(library())}")

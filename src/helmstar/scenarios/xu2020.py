@@ -14,7 +14,7 @@ import numpy as np
 
 from ..attitude import quaternion_of_matrix, svd
 from ..backend import jax, jnp
-from ..core import Gaussian, Measurement, Model, no_gate, pytree
+from ..core import Gaussian, Measurement, Model, Sensor, no_gate, pytree
 from ..evaluate import recursive_bound
 from ..filters import (
     ErrorStateKalmanFilter,
@@ -29,6 +29,7 @@ from ..filters.static import turn_covariance
 from ..geometry import quaternion, small, so3, so3_left, so3_right
 from ..geometry.retraction import Retraction, gibbs_left, quaternion_additive
 from ..models import rigid_body, xu2020
+from ..models.sensors import tangent_basis, unit_star_directions
 from ..units import ARCSEC
 from .experiment import Call, Variable
 from .xu2020_results import WINDOW
@@ -56,7 +57,8 @@ class Setting:
 @pytree
 class Data:
     """Of one run: increments u (steps, 3), stars z (steps, 2, 3), start attitude, Wahba fix at t = 0 and its covariance in
-    B, and the truth q (steps, 4) and r_N that every run shares."""
+    B, and the truth q (steps, 4) and r_N that every run shares. Of stars from images also their covariance (steps, 2, 3, 3) and
+    whether they are seen (steps, 2)."""
 
     u: Array
     z: Array
@@ -65,6 +67,8 @@ class Data:
     fix_cov: Array
     q: Array
     r_N: Array
+    z_cov: Array | None = None
+    seen: Array | None = None
 
 
 # Purposes of the random streams. A key is folded with run, then step, then purpose; a filter that draws numbers takes its
@@ -92,13 +96,62 @@ def _simulate_run(s: Setting, run_id: Array) -> Data:
     return Data(s.increment + s.gyro_sigma * gyro[1:], z[1:], start, fix.q_BN, fix.covariance, s.q[1:], s.r_N)
 
 
-_SHARED = Data(0, 0, 0, 0, 0, None, None)  # which fields of Data have a run axis  # type: ignore[arg-type]
+_SHARED = Data(0, 0, 0, 0, 0, None, None, 0, 0)  # which fields of Data have a run axis  # type: ignore[arg-type]
 
 
 @jax.jit
 def simulate(setting: Setting, run_ids: Array) -> Data:
     """Data of the runs with these numbers; truth is the same for all and has no run axis."""
     return jax.vmap(partial(_simulate_run, setting), out_axes=_SHARED)(run_ids)
+
+
+def _told_predict(params: Any, x: Any, a: tuple[Array, Array]) -> Array:
+    return a[0] @ quaternion.to_matrix(x).T
+
+
+def _told_minus(z: Array, z_hat: Array) -> Array:
+    return jnp.einsum("nij,ni->nj", tangent_basis(z_hat), z - z_hat).reshape(-1)
+
+
+def _told_cov(params: Any, x: Any, a: tuple[Array, Array]) -> Array:
+    T = tangent_basis(_told_predict(params, x, a))
+    C = jnp.einsum("nij,nik,nkl->njl", T, a[1], T) + SIGMA_FLOOR**2 * jnp.eye(2, dtype=T.dtype)
+    o = jnp.zeros((2, 2), T.dtype)
+    return small.blocks([[C[0], o], [o, C[1]]])
+
+
+def measured_directions(retraction: Retraction) -> Sensor:
+    """Two measured directions of unit length, each with a covariance of its own as context (r_N (2, 3), C (2, 3, 3) in B): two
+    residuals for each, across it."""
+
+    def jacobian(params: Any, x: Any, a: tuple[Array, Array]) -> Array:
+        return unit_star_directions(1.0, retraction).jacobian(params, x, a[0])  # type: ignore[misc]
+
+    known = unit_star_directions(1.0, retraction).jacobian is not None
+    return Sensor(_told_predict, _told_minus, _told_cov, None, jacobian if known else None)
+
+
+@pytree
+class Pictures:
+    """What frames of stars say, of all runs: z (runs, steps + 1, 2, 3), cov (.., 2, 3, 3) rad^2, seen (.., 2)."""
+
+    z: Array
+    cov: Array
+    seen: Array
+
+
+@jax.jit
+def simulate_from_images(setting: Setting, pictures: Pictures, run_ids: Array) -> Data:
+    """As `simulate`, with the stars that the frames show: the gyro and the start are the same to the bit."""
+
+    def one(run_id: Array) -> Data:
+        d = _simulate_run(setting, run_id)
+        z, cov, seen = pictures.z[run_id], pictures.cov[run_id], pictures.seen[run_id]
+        sigma = jnp.sqrt(0.5 * jnp.trace(cov[0], axis1=-2, axis2=-1))
+        fix = svd(z[0], setting.r_N, jnp.maximum(sigma, SIGMA_FLOOR))
+        return Data(d.u, z[1:], d.start, fix.q_BN, fix.covariance, d.q, d.r_N, cov[1:], seen[1:])
+
+    return jax.vmap(one, out_axes=_SHARED)(run_ids)
 
 
 @pytree
@@ -130,9 +183,12 @@ def error_in_N(retraction: Retraction, truth: Array, belief: Any) -> tuple[Array
     return xi, jnp.sqrt(jnp.diagonal(P_N)), jnp.sum(white**2)
 
 
-@partial(jax.jit, static_argnames=("filter",))
-def estimate(model: Model, prior: Prior, stars: Array, data: Data, *, filter: Any) -> dict[str, Array]:
-    """Track of one estimator over all runs of `data`. `stars` (2,) of bool says which stars it sees."""
+@partial(jax.jit, static_argnames=("filter", "measured"))
+def estimate(
+    model: Model, prior: Prior, stars: Array, data: Data, *, filter: Any, measured: bool = False
+) -> dict[str, Array]:
+    """Track of one estimator over all runs of `data`. `stars` (2,) of bool says which stars it sees; `measured`: whether it is
+    told the covariance that came with each."""
     retraction = filter.retraction
     steps = data.q.shape[0]
 
@@ -143,7 +199,11 @@ def estimate(model: Model, prior: Prior, stars: Array, data: Data, *, filter: An
         belief: Any = Gaussian(mean, cov)
         if prior.spread is not None:
             belief = UnscentedBelief(mean, cov, prior.spread)
-        m = Measurement(data.z, jnp.broadcast_to(data.r_N, (steps, 2, 3)), jnp.broadcast_to(stars, (steps, 2)))
+        context: Any = jnp.broadcast_to(data.r_N, (steps, 2, 3))
+        if measured:
+            context = (context, data.z_cov)
+        there = jnp.broadcast_to(stars, (steps, 2))
+        m = Measurement(data.z, context, there if data.seen is None else there & data.seen)
 
         def keep(belief, predicted, infos):
             return belief, infos[0].nis, infos[0].dof
@@ -179,7 +239,7 @@ class Experiment:
     variables = VARIABLES
     coordinates: ClassVar[dict[str, Any]] = {}
 
-    def __init__(self, spec: Specification, name: str = "xu2020"):
+    def __init__(self, spec: Specification, name: str = "xu2020", workers: int = 1):
         self.spec = spec
         self.name = name
         self.title = spec.title
@@ -201,7 +261,20 @@ class Experiment:
             "seed": np.asarray(spec.seed),
         }
         self.simulate = Call(simulate, (Setting(**data),))
+        self.pictures = self._pictures(workers) if spec.star.level == "image" else None
+        if self.pictures is not None:
+            self.star_sigma = self.pictures.sigma
+            arrays = Pictures(self.pictures.z, self.pictures.cov, self.pictures.seen)  # type: ignore[arg-type]
+            self.simulate = Call(simulate_from_images, (Setting(**data), arrays))
         self.estimators = self._estimators()
+
+    def _pictures(self, workers: int) -> Any:
+        """Frames of every run that will be computed, solved."""
+        from .xu2020_images import take_frames
+
+        s = self.spec
+        runs = -(-s.runs // s.width) * s.width
+        return take_frames(s.star.image, s.seed, runs, s.step_s, self.truth.q, np.array(s.star.directions), workers)
 
     def _estimators(self) -> dict[str, Call]:
         t = self.spec.tuning
@@ -209,11 +282,17 @@ class Experiment:
         sigma = max(self.star_sigma, SIGMA_FLOOR)
         q = self.gyro_sigma**2
         spread = scaled(t.ukf_alpha, t.ukf_beta, t.ukf_kappa)
+        from_images = self.pictures is not None
 
         def call(filter: Any, model: Model, stars: Any, P0: Any, spread: Spread | None = None, fix: bool = False):
             from_fix: Any = np.asarray(fix)
             prior = Prior(P0, from_fix, spread)
-            return Call(estimate, (model, prior, stars), {"filter": filter})
+            static = {"filter": filter}
+            if from_images and fix and not isinstance(filter, StaticSolver):
+                told = measured_directions(model.retraction)
+                model = Model(model.retraction, model.process, (told,))
+                static["measured"] = True
+            return Call(estimate, (model, prior, stars), static)
 
         right, left = ErrorStateKalmanFilter(so3_right), ErrorStateKalmanFilter(so3_left)
         gibbs, additive = ErrorStateKalmanFilter(gibbs_left), ErrorStateKalmanFilter(quaternion_additive)
@@ -243,10 +322,28 @@ class Experiment:
         """Cramer-Rao covariance (updates, 3, 3) of xi in N, rad^2, from the fix at t = 0 on; NaN without star noise."""
         if self.star_sigma == 0.0:
             return np.full((len(self.time), 3, 3), np.nan)
-        r = np.array(self.spec.star.directions)
-        J = (2.0 * np.eye(3) - r.T @ r) / self.star_sigma**2
+        if self.pictures is not None:
+            J = self._information()
+            first, J = J[0], J[1:]
+        else:
+            r = np.array(self.spec.star.directions)
+            first = J = (2.0 * np.eye(3) - r.T @ r) / self.star_sigma**2
         A = np.asarray(so3.exp(-self.truth.increment))
-        return recursive_bound(A, self.gyro_sigma**2 * np.eye(3), J, np.linalg.inv(J))
+        return recursive_bound(A, self.gyro_sigma**2 * np.eye(3), J, np.linalg.inv(first))
+
+    def _information(self) -> np.ndarray:
+        """Of the frames at each instant from 0 (steps + 1, 3, 3), on xi in N: the mean over the runs of what each head's
+        covariance across its direction leaves, [r x] C_N^+ [r x]^T."""
+        assert self.pictures is not None
+        R = np.asarray(quaternion.to_matrix(self.truth.q))
+        out = np.zeros((len(R), 3, 3))
+        for head, r in enumerate(np.array(self.spec.star.directions)):
+            C = np.einsum("kji,rkjl,klm->rkim", R, self.pictures.cov[:, :, head], R)
+            across = np.linalg.pinv(C, rcond=1e-6, hermitian=True)
+            seen = self.pictures.seen[:, :, head, None, None]
+            K = np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
+            out += np.mean(np.where(seen, K @ across @ K.T, 0.0), axis=0)
+        return out
 
     def fixed(self) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]]:
         """Truth and bound."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -15,6 +16,9 @@ Positive = Annotated[float, Field(ge=1e-30, le=1e12, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False)]
 Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 LEAST_STAR_ARCSEC = 1e-6
+OF_IMAGES = {"runs": 4, "width": 4, "updates": 240}
+"""What stands for these keys at level "image" where nobody says otherwise: each update takes two frames of some 30 ms."""
+LONGEST_SMEAR_PX = 30.0
 LARGEST_INERTIA_RATIO = 1e6  # above it Euler's equations are so stiff that the integrator hardly moves
 
 
@@ -53,9 +57,23 @@ class Truth(_Table):
         return rows
 
 
+class StarImage(_Table):
+    """Camera and exposure of a star sensor whose measurements come from pixels."""
+
+    fov_deg: Annotated[float, Field(ge=4, le=30, allow_inf_nan=False)]
+    pixels: Annotated[int, Field(ge=64, le=4096)]
+    exposure_s: Annotated[float, Field(ge=1e-4, le=100, allow_inf_nan=False)]
+    limit_magnitude: Annotated[float, Field(ge=3, le=9, allow_inf_nan=False)]
+    zero_point_e_s: Annotated[float, Field(ge=1e3, le=1e10, allow_inf_nan=False)]
+    psf_sigma_px: Annotated[float, Field(ge=0.3, le=5, allow_inf_nan=False)]
+    hot_pixels: Annotated[int, Field(ge=0, le=10_000)]
+
+
 class Star(_Table):
     directions: Annotated[list[Vector3], Field(min_length=2, max_length=2)]
     sigma_arcsec: Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
+    level: Literal["direction", "image"]
+    image: StarImage
 
     @field_validator("sigma_arcsec")
     @classmethod
@@ -105,6 +123,38 @@ class Specification(ScenarioSpecification):
     gyro: Gyro
     start: Start = Start()
     tuning: TuningTable
+
+    @classmethod
+    def adapted(cls, content: Mapping[str, Any], stated: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Fewer and shorter runs at level "image", unless they are stated."""
+        star = content.get("star")
+        if not (isinstance(star, Mapping) and star.get("level") == "image"):
+            return content
+        return {**content, **{k: v for k, v in OF_IMAGES.items() if k not in stated}}
+
+    @property
+    def note(self) -> str:
+        """What the user should know before it starts."""
+        if self.star.level != "image":
+            return ""
+        blocks = -(-self.runs // self.width)
+        frames = 2 * blocks * self.width * (self.updates + 1)
+        return (
+            f"star.level = image: {frames} frames are rendered and solved first; unless stated there are "
+            f"{OF_IMAGES['runs']} runs of {OF_IMAGES['updates']} updates (--runs, --set updates=, --set width=)"
+        )
+
+    @model_validator(mode="after")
+    def _smear_is_bounded(self) -> Specification:
+        image = self.star.image
+        focal = 0.5 * image.pixels / np.tan(0.5 * np.radians(image.fov_deg))
+        smear = np.sqrt(3.0) * abs(self.truth.rate_amplitude_rad_s) * image.exposure_s * focal
+        if self.star.level == "image" and smear > LONGEST_SMEAR_PX:
+            raise ValueError(
+                f"truth.rate_amplitude_rad_s = {self.truth.rate_amplitude_rad_s} with star.image.exposure_s = "
+                f"{image.exposure_s}: stars would be drawn out over {smear:.3g} px; at most {LONGEST_SMEAR_PX:g} are solved"
+            )
+        return self
 
     @model_validator(mode="after")
     def _steps_resolve_the_rate(self) -> Specification:

@@ -121,7 +121,7 @@ def _walk(record: Record, start: Start, rate: np.ndarray, limit: float) -> float
     grid = np.linspace(low, high, 9)
     best = int(np.argmin([cost(g) for g in grid]))
     around = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
-    found = minimize_scalar(cost, bounds=around, method="bounded", options={"xatol": 0.05, "maxiter": 20})
+    found = minimize_scalar(cost, bounds=around, method="bounded", options={"xatol": 0.2, "maxiter": 8})
     return float(np.exp(found.x))  # pyright: ignore[reportAttributeAccessIssue]
 
 
