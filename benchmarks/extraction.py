@@ -1,5 +1,8 @@
 """Time of star extraction on rendered frames: `python benchmarks/extraction.py`; beside sep where that is installed.
 
+"the next frame" knows the optics from the one before, "in 50 windows" also where stars are expected; at the end a whole solution, from
+the image to the attitude, by stages.
+
 CPU time and wall time of one call, the least and the median of many, because a shared processor only ever adds.
 """
 
@@ -13,7 +16,10 @@ from collections.abc import Callable
 import numpy as np
 
 from helmstar.imaging import Camera, DetectionSettings, Image, detect
+from helmstar.imaging.detect import detect_near, detect_next
 from helmstar.imaging.render import Exposure, render
+from helmstar.sensors.star_tracker import StarTracker
+from helmstar.stars import load_catalog
 
 
 def frame(width: int, height: int, stars: int, bits: int) -> Image:
@@ -57,6 +63,15 @@ def main() -> None:
                 f"{name:28s} {what:22s} {count:5d} "
                 + "{:9.2f} {:9.2f} {:7.2f}".format(*timed(lambda s=settings, i=image: detect(i, s), repeats))
             )
+        _, optics = detect_next(image)
+        if optics is not None:
+            places = detect(image).xy_px[:50]
+            calls = {
+                "the next frame": lambda i=image, o=optics: detect_next(i, optics=o),
+                "in 50 windows": lambda i=image, o=optics, p=places: detect_near(i, p, 5.0, o),
+            }
+            for what, call in calls.items():
+                print(f"{name:28s} {what:22s} {'':5s} " + "{:9.2f} {:9.2f} {:7.2f}".format(*timed(call, repeats)))
         if sep is not None:
             array = image.array.astype(np.float32)
 
@@ -70,5 +85,23 @@ def main() -> None:
             )
 
 
+def solutions(repeats: int) -> None:
+    """From image to attitude, 1024 x 768 with 8 bits, by stages: without a prior and tracking."""
+    camera, catalog = Camera.from_fov(12.0, 1024, 768), load_catalog(8.5)
+    q = np.array([0.2, -0.5, 0.4, 0.7]) / np.sqrt(0.94)
+    exposure = Exposure(bits=8, gain_e=10.0, offset=5.0)
+    image, _ = render(camera, q, catalog.directions(), catalog.magnitude, exposure, 1)
+    print("\nimage to attitude, ms, least (median)")
+    for stars in (100, 40):
+        tracker = StarTracker(camera, detection=DetectionSettings(max_stars=stars))
+        for what, prior in (("full sky", {}), ("tracking", {"prior_q_SN": q, "prior_sigma": 1e-4})):
+            tracker.solve(image)
+            runs = [tracker.solve(image, **prior) for _ in range(repeats)]
+            stages = {k: [r.ms[k] for r in runs] for k in runs[0].ms}
+            said = ", ".join(f"{k} {min(v):.2f} ({np.median(v):.2f})" for k, v in stages.items())
+            print(f"{what}, at most {stars} stars: {len(runs[0].identification.stars)} matched; {said}")
+
+
 if __name__ == "__main__":
     main()
+    solutions(50)
