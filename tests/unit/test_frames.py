@@ -142,7 +142,7 @@ def test_later_frames_are_tracked_and_agree_with_lost_in_space(night, monkeypatc
     assert np.array_equal(tracked.row, searched.row)
     off = (Rotation.from_quat(tracked.q_SN) * Rotation.from_quat(searched.q_SN).inv()).as_rotvec()
     sigma = np.sqrt(np.diagonal(searched.covariance_S, axis1=1, axis2=2))
-    assert np.all(np.abs(off) < sigma)  # not the same to the bit: the last few faint stars may differ
+    assert np.all(np.abs(off) < 3.0 * sigma)  # not the same to the bit: windows hold the bright stars only
 
 
 @pytest.mark.parametrize("form", ["fits", "tiff"])

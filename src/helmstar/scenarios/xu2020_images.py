@@ -149,6 +149,7 @@ def solve_block(task: _Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     image = StarImage.model_validate(task.image)
     tracker, directions, magnitude = _head(json.dumps(task.image))
+    tracker.memory = None  # of another block
     n = len(task.q)
     z, cov, seen = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros(n, dtype=bool)
     reach = np.cos(_half_diagonal(tracker.camera))
@@ -189,7 +190,8 @@ def _head(image: str) -> tuple[Any, np.ndarray, np.ndarray]:
     camera = Camera.from_fov(spec.fov_deg, spec.pixels, spec.pixels)
     catalog = load_catalog(spec.limit_magnitude)
     # What is rendered is a Gaussian to the last digit: nothing but noise makes its centroids wrong.
-    return StarTracker(camera, detection=DetectionSettings(optics_px=0.0)), catalog.directions(), catalog.magnitude
+    tracker = StarTracker(camera, julian_year=2000.0, detection=DetectionSettings(optics_px=0.0))
+    return tracker, catalog.directions(), catalog.magnitude
 
 
 def _rates(q: np.ndarray, step_s: float) -> np.ndarray:
