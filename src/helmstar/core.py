@@ -42,10 +42,16 @@ def pytree_with(static: tuple[str, ...]) -> Callable[[type[T]], type[T]]:
 
 @dataclass(frozen=True)
 class Noise:
-    """Driving noise w of a process: `cov(params, x, u, dt)` is its covariance (dim, dim) over one step."""
+    """Driving noise w of a process, of zero mean: `cov(params, x, u, dt)` is its covariance (dim, dim) over one step.
+
+    sample(params, x, u, dt, key) draws w (dim,), logpdf(params, x, u, dt, w) is its log density: None stands for a Gaussian.
+    Kalman filters use the covariance alone. A known mean belongs to the step.
+    """
 
     cov: Callable[[Any, State, Any, Array], Array]
     dim: int
+    sample: Callable[[Any, State, Any, Array, Array], Array] | None = None
+    logpdf: Callable[[Any, State, Any, Array, Array], Array] | None = None
 
 
 @pytree_with(static=("step", "noise", "jacobian"))
@@ -96,6 +102,28 @@ class Gaussian:
 
 
 @pytree
+class Particles:
+    """Belief: points (a State with leading axis n), log_weights (n,) that sum to one, the key of what is drawn next, and the
+    effective number of points after the last update, before they were drawn anew."""
+
+    points: State
+    log_weights: Array
+    key: Array
+    effective: Array
+
+
+@pytree
+class Mixture:
+    """Belief: Gaussian components (leading axis n), log_weights (n,) that sum to one, key and effective number as in
+    `Particles`."""
+
+    components: Any
+    log_weights: Array
+    key: Array
+    effective: Array
+
+
+@pytree
 class Predicted:
     """What a smoother needs of a prediction: the predicted belief and F = d(predicted error)/d(previous error)."""
 
@@ -104,10 +132,10 @@ class Predicted:
     F: Array
 
 
-ABSENT, ACCEPTED, GATED, REOPENED, FORCED, RESET = range(6)
+ABSENT, ACCEPTED, GATED, REOPENED, FORCED, RESET, DEGENERATE = range(7)
 """Status of an update: no measurement; used; refused by the gate; refused once too often, so that the covariance was
 grown to open the gate again, without use of the measurement; used although the gate, opened again, still refused it (see
-`Gate`); belief started anew."""
+`Gate`); belief started anew; no particle explains the measurement, or hardly more than one does."""
 
 
 @pytree

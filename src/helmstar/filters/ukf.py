@@ -14,13 +14,13 @@ Update as in the EKF: covariance carried to the new mean, gate, masks.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from ..backend import jax, jnp
 from ..core import Gate, Gaussian, Info, Measurement, Predicted, Process, Sensor, pytree
 from ..geometry import small
 from ..geometry.retraction import Retraction
-from .ekf import Carry, carry_covariance, doubt, gain, grow, information, judge, prepare
+from .ekf import Carry, ErrorStateKalmanFilter, carry_covariance, doubt, gain, grow, information, judge, prepare
 
 Array = jax.Array
 
@@ -72,19 +72,27 @@ def _weighted_outer(w: Array, a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True)
 class UnscentedKalmanFilter:
-    """UKF over any retraction. The spread travels with the belief's type, `UnscentedBelief`, as data."""
+    """UKF over any retraction. The spread travels with the belief's type, `UnscentedBelief`, as data.
+
+    prediction: "unscented" points, or "linear" by the process's Jacobians as in the EKF, which is the same for a process that is
+    linear in its error and costs a tenth.
+    """
 
     retraction: Retraction
     carry: Carry = "transport"
+    prediction: Literal["unscented", "linear"] = "unscented"
 
     def predict(
         self, belief: UnscentedBelief, process: Process, u: Any, dt: Array
     ) -> tuple[UnscentedBelief, Predicted]:
         """Belief after one step of dt seconds; F is the statistical linearisation P_xx' (P)^-1 that a smoother uses."""
+        if self.prediction == "linear":
+            b, predicted = ErrorStateKalmanFilter(self.retraction).predict(belief, process, u, dt)
+            return UnscentedBelief(b.mean, b.cov, belief.spread), predicted
         r, x, P = self.retraction, belief.mean, belief.cov
         n, q = r.dim, process.noise.dim
         distance, _, centre_cov, w = belief.spread.weights(n + q)
-        root = small.cholesky(P)
+        root = _root(P)  # states that were drawn (see mixture.py) have no variance
         xi = _points(root, distance)
         noise = _points(_root(process.noise.cov(process.params, x, u, dt)), distance)
         zero_w, zero_x = jnp.zeros(q, P.dtype), jnp.zeros(n, P.dtype)
@@ -105,7 +113,7 @@ class UnscentedKalmanFilter:
         d_x, d_w, d_0 = deviations(mean)
         cov = _weighted_outer(w, d_x, d_x) + _weighted_outer(w, d_w, d_w) + centre_cov * d_0[:, None] * d_0[None, :]
         cross = _weighted_outer(w, d_x, xi)
-        V = small.invert_lower(root)
+        V = small.invert_lower(_without_zeros(root))
         F = small.matmul(small.matmul(cross, small.transpose(V)), V)
         return UnscentedBelief(mean, cov, belief.spread), Predicted(mean, cov, F)
 
@@ -133,6 +141,12 @@ class UnscentedKalmanFilter:
         cov = grow(P, nis, R, S, status) - small.congruence(K, S + R - doubt(R, nis, dof, status))
         cov = small.symmetrise(carry_covariance(r, self.carry, x, d, cov))
         return UnscentedBelief(r.boxplus(x, d), cov, belief.spread), info
+
+
+def _without_zeros(L: Array) -> Array:
+    """A root with a unit diagonal where it has none, so that it can be inverted."""
+    eye = jnp.eye(L.shape[0], dtype=L.dtype)
+    return jnp.where((jnp.diagonal(L) == 0.0)[:, None], eye, L)
 
 
 def _root(Q: Array) -> Array:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import campaign_figures as parts
-from . import zhou2021
+from . import li2007, zhou2021
 from .campaign_data import Campaign
 from .campaign_table import add_summary_table, headline
 from .claims import Claim, add_claims
@@ -43,23 +43,23 @@ def monte_carlo_page(dataset: xarray.Dataset, summary: dict[str, Any], claims: S
         subtitle=f"Scenario `{campaign.scenario}`, {runs} of {int(campaign.update[-1])} updates, seed {campaign.seed}",
     )
     page.section("Result")
-    orbit = campaign.attrs.get("experiment") == "zhou2021"
-    page.headline(*(zhou2021.headline(summary) if orbit else headline(campaign)))
+    own: Any = {"zhou2021": zhou2021, "li2007": li2007}.get(str(campaign.attrs.get("experiment")))
+    page.headline(*(own.headline(summary) if own else headline(campaign)))
     if campaign.runs < campaign.requested:
         page.notice(
             f"The campaign was interrupted: {campaign.runs} of {campaign.requested} runs are finished. Every figure "
             "on this page is about the finished runs; the same command with `--resume` does the others."
         )
-    lost = campaign.lost_runs()
+    lost = campaign.lost_runs() if "error_rad" in dataset else {}
     if lost:
         names = ", ".join(f"`{name}` ({count})" for name, count in lost.items())
         page.notice(f"Runs whose estimate was no longer a number at the end: {names}. They count as not converged.")
     if claims:
         page.section("The paper's claims", short="Claims")
         add_claims(page, claims)
-    if orbit:
-        zhou2021.add_sections(page, dataset, campaign)
-        if campaign.runs:
+    if own:
+        own.add_sections(page, dataset, campaign)
+        if campaign.runs and own is zhou2021:
             parts.add_consistency(page, campaign)
             parts.add_bound_and_time(page, campaign)
         _add_origin(page, campaign)

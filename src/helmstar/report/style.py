@@ -36,6 +36,17 @@ _ESTIMATORS = {
     "mekf_rate_state": (GREY, "hexagon-open"),
     "predictive": (AMBER, "pentagon-open"),
     "smoother": (GREEN, "star"),
+    "ekf": (BLUE, "circle-open"),
+    "ukf_printed": (AMBER, "pentagon-open"),
+    "pf": (PINK, "triangle-up-open"),
+    "rpf": (GREY, "hexagon-open"),
+    "upf_printed": (RED, "triangle-down-open"),
+    "upf": (GREEN, "diamond-open"),
+    "rbpf": (SKY, "star-open"),
+    "gsf": (ORANGE, "square-open"),
+    "batch": (INK, "x"),
+    "ekf_position_velocity": (RED, "cross"),
+    "ekf_position_velocity_pointing": (SKY, "circle"),
 }
 _OTHERS = [(SKY, "circle"), (ORANGE, "square"), (GREEN, "diamond"), (PINK, "triangle-up"), (VIOLET, "triangle-down")]
 TUNED = "_tuned"

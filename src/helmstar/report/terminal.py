@@ -13,6 +13,8 @@ def print_campaign(summary: dict[str, Any]) -> None:
     """One line for each estimator, at most 88 columns."""
     if any("drift_rms_deg_h" in m for m in summary["estimators"].values()):
         return _print_attitude_and_drift(summary)
+    if any("last60_error_km" in m for m in summary["estimators"].values()):
+        return _print_position(summary)
     runs = summary["runs"]
     last = list(next(iter(summary["estimators"].values()))["median_error_deg"])[-1]
     print(f"{summary['scenario']}: {runs} runs, seed {summary['seed']}, {summary['wall_s']:.1f} s")
@@ -63,6 +65,20 @@ def _print_attitude_and_drift(summary: dict[str, Any]) -> None:
     print("attitude, drift: RMS of the last 1000 s, worst axis; NEES/6: 1 when consistent;")
     print("signs: updates with the wrong sign; loss: median peak error, gyro lost for a minute, mean held;")
     print("179 deg: runs that recover from a start so far off within 300 s")
+
+
+def _print_position(summary: dict[str, Any]) -> None:
+    runs = summary["runs"]
+    print(f"{summary['scenario']}: {runs} runs, seed {summary['seed']}, {summary['wall_s']:.1f} s")
+    heads = ("estimator", "mean x", "y", "z km", "last 60 s x", "y", "z km", "NEES/n", "diverged")
+    widths = (31, 8, 7, 7, 12, 7, 7, 8, 9)
+    print("".join(h.ljust(w) if i == 0 else h.rjust(w) for i, (h, w) in enumerate(zip(heads, widths, strict=True))))
+    for name, m in summary["estimators"].items():
+        values = (*m["mean_error_km"], *m["last60_error_km"], m["nees_per_state"])
+        row = (name, *(_number(v) for v in values), str(m["diverged"]))
+        print("".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))))
+    print("mean: |truth - estimate| over runs and frames; NEES/n: 1 when consistent;")
+    print("diverged: runs more than 5 km off over the last 60 s")
 
 
 def print_attitude(result: dict[str, Any]) -> None:
