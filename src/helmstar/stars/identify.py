@@ -22,8 +22,8 @@ MOST_DETECTIONS = 120
 """The brightest of a longer list are used."""
 FEWEST = 3
 """Stars that a solution must match; with a known zero point of magnitudes 2 may do."""
-LIMIT = 1e-6
-"""Default of the largest probability that a solution is false."""
+LIMIT = 1e-5
+"""Default of the largest probability that a solution is false: a tenth of the share of false solutions that is borne, 1e-4."""
 KEPT = 5
 """Hypotheses of each chunk that are screened."""
 DEPTHS = ((BRIGHTEST, 1.0), (BRIGHT, 1.0), (FAINT, 0.15))
@@ -173,7 +173,8 @@ def prepare(
     brightness = None if m is None else m[order]
     per_axis = np.sqrt(0.5 * (C[:, 0, 0] + C[:, 1, 1]))
     density = _log_density(brightness) if brightness is not None and len(order) else np.zeros(len(order))
-    d = Detections(p, per_axis, brightness, magnitude_sigma, zero_point, density, low, high, order)
+    places = _log_place_density(p, float(np.prod(high - low)))
+    d = Detections(p, per_axis, brightness, magnitude_sigma, zero_point, density, places, low, high, order)
     return d, C
 
 
@@ -195,6 +196,17 @@ def _log_density(m: np.ndarray) -> np.ndarray:
     smooth = np.exp(-0.5 * z * z).mean(axis=1) / (width * np.sqrt(2.0 * np.pi))
     even = 1.0 / (np.ptp(m) + 2.0 * width)
     return np.log(0.5 * smooth + 0.5 * even)
+
+
+def _log_place_density(p: np.ndarray, area: float) -> np.ndarray:
+    """Log density (n,) 1/px^2 of the detections, one more counted: half even over the image, half smoothed from the others."""
+    n = len(p)
+    if n < 2:
+        return np.full(n, np.log((n + 1.0) / area))
+    width = 0.5 * np.sqrt(area / n)
+    square = ((p[:, None] - p[None]) ** 2).sum(axis=2)
+    others = np.exp(-0.5 / width**2 * square).sum(axis=1) - 1.0
+    return np.log(0.5 / area + 0.5 * others / (n - 1.0) / (2.0 * np.pi * width**2)) + np.log(n + 1.0)
 
 
 def focal_freedom(camera: Camera, fov_range: tuple[float, float] | None, focal_sigma: float) -> Freedom:
@@ -250,9 +262,10 @@ def weigh(
         if odds[k] < HOPELESS:
             break
         # A hypothesis on top of a fit would lead there again. Not so one nearby: a short pair may have led to a poor fit.
-        if any(same(R[k], f[k], fit, closest / f[k], 1e-3) for fit in fits):
+        focal = float(f[k])
+        if any(same(R[k], focal, fit, closest / focal, 1e-3) for fit in fits):
             continue
-        fit = verify(sky, level, d, R[k], float(f[k]), freedom, first_gate=2.5, rounds=2)
+        fit = verify(sky, level, d, R[k], focal, freedom, first_gate=2.5, rounds=2)
         if fit is None or len(fit.stars) < fewest:
             continue
         add(fits, fit)

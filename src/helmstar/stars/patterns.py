@@ -250,8 +250,8 @@ class Sky:
         # Of a band of declinations; importing scipy's trees would take the first solution 0.5 s.
         members, directions = self._deep[i]
         dec = float(np.arcsin(np.clip(centre[2], -1.0, 1.0)))
-        low, high = np.sin(np.clip([dec - radius, dec + radius], -0.5 * np.pi, 0.5 * np.pi)) + [-1e-12, 1e-12]
-        begin, end = np.searchsorted(directions[:, 2], [low, high])
+        low, high = np.sin(np.clip([dec - radius, dec + radius], -0.5 * np.pi, 0.5 * np.pi))
+        begin, end = np.searchsorted(directions[:, 2], [low - 1e-12, high + 1e-12])
         return np.sort(members[begin:end][directions[begin:end] @ centre > np.cos(radius)])
 
 

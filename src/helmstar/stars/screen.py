@@ -86,7 +86,7 @@ def screen(
     for gate in (FIRST_GATE, SECOND_GATE):
         v = np.matmul(R[who], r[:, :, None])[:, :, 0]
         p = v[:, :2] * (f[who] / np.maximum(v[:, 2], 1e-3))[:, None]
-        seen = np.flatnonzero(inside(p, d.low, d.high) & (v[:, 2] > 1e-3))
+        seen = np.flatnonzero(inside(p, d.low, d.high) & (v[:, 2] > 1e-3) & (d.faintest >= V))
         # The stars of a hypothesis come brightest first: rank is the place among those seen.
         first = np.searchsorted(who[seen], np.arange(len(f) + 1))
         rank = np.arange(len(seen)) - first[who[seen]]
@@ -112,7 +112,7 @@ def screen(
             f = np.clip(f * np.exp(np.clip(change, -0.1, 0.1)), 0.97 * freedom.f_low, 1.03 * freedom.f_high)
             continue
         zero = _zero_points(d, V[seen], j, h, count)
-        gain = -0.5 * square - np.log(2.0 * np.pi * d.sigma[j] ** 2 * d.density)
+        gain = -0.5 * square - np.log(2.0 * np.pi * d.sigma[j] ** 2) - d.log_density[j]
         gain += magnitude_gain(d, V[seen], j, zero[h])
         good = np.flatnonzero(gain > 0.0)
         seen, rank, j, gain, h, u = seen[good], rank[good], j[good], gain[good], h[good], u[good]
@@ -123,7 +123,7 @@ def screen(
         for k in np.flatnonzero(count >= 2):
             s = slice(edge[k], edge[k + 1])
             expected = min(int(first[k + 1] - first[k]), most)
-            odds[k] = log_odds(gain[s], rank[s], expected) + zero_point_price(d, int(count[k])) + volume[k]
+            odds[k] = log_odds(gain[s], rank[s], expected, d.vacancy) + zero_point_price(d, int(count[k])) + volume[k]
     return odds, R, f
 
 

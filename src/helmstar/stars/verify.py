@@ -6,9 +6,11 @@ expected in the image matched, residuals r_j (px), detections of density lam (1/
     odds = prod_j [ N(r_j; s^2 C_j) p(m_j | star) / (lam p(m_j)) ]  B(1 + k, 1 + S - k) / B(1, 1)
            x sqrt(det 2 pi P) / V.
 
+- lam is the detections' own density, smoothed, so that a clump of false ones is no wonder. With k matches the others are fewer
+  than lam says: (n + 1)^k (n - k)! / n! with the rate of false detections integrated out.
 - The middle factor is the chance of k detections among S stars with the detection probability integrated out (uniform prior), so
   a field that misses its bright stars pays for it and one that misses 60% evenly still passes. S is unknown too: how deep the
-  image is. The odds are averaged over all S.
+  image is. The odds are averaged over all S, with 1/S as prior.
 - The last factor is the price of having fitted the attitude (and focal length): the volume that the fit leaves over the volume V
   that it was chosen from, 8 pi^2 for SO(3). It takes the place of a count of tested hypotheses, and with it the odds are
   posterior odds whatever the search did. The zero point of the magnitudes and the scale s pay likewise.
@@ -30,6 +32,7 @@ BROAD_SHARE, BROAD_SIGMA, BROAD_FACTOR = 0.15, 1.5, 6.0
 ZERO_POINT_RANGE = 10.0
 """Where an unknown zero point may lie (mag, full width): sets the price of fitting it."""
 LOG_FACTORIAL = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1.0, 400.0)))])
+HARMONIC = np.concatenate([[1.0], np.cumsum(1.0 / np.arange(1.0, 400.0))])
 SO3_VOLUME = 8.0 * np.pi**2
 HOPELESS = -14.0
 """Log odds after the first step below which a hypothesis is dropped."""
@@ -49,7 +52,8 @@ class Detections:
     """What identification knows of an image; every array has its brightest entry first where brightness is known.
 
     xy: (n, 2) ideal pixels from the principal point. sigma: (n,) px, per axis. magnitude: (n,) or None, of unknown zero point
-    unless `zero_point` (V minus magnitude) is given. log_magnitude_density: (n,) log of the detections' own magnitude density.
+    unless `zero_point` (V minus magnitude) is given. log_magnitude_density: (n,) log of the detections' own magnitude density,
+    log_density: (n,) log of their own density in the image (1/px^2), one more counted.
     low, high: (2,) corners of the image in ideal pixels. order: (n,) index in the caller's list.
     """
 
@@ -59,6 +63,7 @@ class Detections:
     magnitude_sigma: float
     zero_point: float | None
     log_magnitude_density: np.ndarray
+    log_density: np.ndarray
     low: np.ndarray
     high: np.ndarray
     order: np.ndarray
@@ -68,9 +73,20 @@ class Detections:
         return float(np.prod(self.high - self.low))
 
     @cached_property
-    def density(self) -> float:
-        """Of false detections, 1/px^2. It cannot be read from a list that is all true: at least one per image, on top."""
-        return (len(self.xy) + 1.0) / self.area
+    def vacancy(self) -> np.ndarray:
+        """(n + 1,) log of what k = 0 ... n matches gain by leaving fewer detections to be false: (n + 1)^k (n - k)! / n!.
+
+        The rate of false detections is unknown, with an even prior; `log_density` counts all n and one more as false.
+        """
+        n = len(self.xy)
+        return np.concatenate([[0.0], np.cumsum(np.log((n + 1.0) / np.arange(n, 0, -1)))])
+
+    @cached_property
+    def faintest(self) -> float:
+        """V of the faintest star that may be among them: where the zero point is known, infinity elsewhere."""
+        if self.zero_point is None or self.magnitude is None or len(self.xy) == 0:
+            return math.inf
+        return float(self.magnitude[-1]) + self.zero_point + 3.0 * self.magnitude_sigma
 
     @cached_property
     def typical_sigma(self) -> float:
@@ -236,15 +252,18 @@ def zero_point(d: Detections, V: np.ndarray, j: np.ndarray) -> float:
     return middle(V - d.magnitude[j]) if d.zero_point is None else d.zero_point
 
 
-def log_odds(gain: np.ndarray, rank: np.ndarray, expected: int) -> float:
-    """Of the matches, without the price of the fit: gain (k,) in the order of rank (k,) among the expected stars."""
+def log_odds(gain: np.ndarray, rank: np.ndarray, expected: int, vacancy: np.ndarray) -> float:
+    """Of the matches, without the price of the fit: gain (k,) in the order of rank (k,) among the expected stars.
+
+    The depth S has a prior of 1/S, which favours no scale.
+    """
     depth = np.arange(1, expected + 1)
     k = np.searchsorted(rank, depth, side="left")
     # B(1 + k, 1 + S - k) = k! (S - k)! / (S + 1)!
     beta = LOG_FACTORIAL[k] + LOG_FACTORIAL[depth - k] - LOG_FACTORIAL[depth + 1]
-    total = np.concatenate([[0.0], np.cumsum(gain)])[k] + beta
+    total = (np.concatenate([[0.0], np.cumsum(gain)]) + vacancy[: len(gain) + 1])[k] + beta
     top = total.max()
-    return float(top + np.log(np.exp(total - top).sum()) - np.log(expected))
+    return float(top + np.log((np.exp(total - top) / depth).sum() / HARMONIC[expected]))
 
 
 def verify(
@@ -302,7 +321,7 @@ class _Field:
         d, freedom, zero = self.d, self.freedom, self.d.zero_point
         for turn_number in range(rounds + 1):
             p, _ = project(self.r, R, f)
-            seen = np.flatnonzero(inside(p, d.low, d.high))[: self.limit]
+            seen = np.flatnonzero(inside(p, d.low, d.high) & (d.faintest >= self.V))[: self.limit]
             p = p[seen]
             widen = (first_gate, 0.5 * (1.0 + first_gate), 1.0)[min(turn_number, 2)]
             excess = None
@@ -318,13 +337,15 @@ class _Field:
             if turn_number == rounds or (turn_number == 1 and rounds > 2):
                 V = self.V[seen[i]]
                 zero = zero_point(d, V, j)
-                gain = magnitude_gain(d, V, j, zero) - 0.5 * square - np.log(2.0 * np.pi * sigma**2 * d.density)
+                gain = magnitude_gain(d, V, j, zero) - 0.5 * square - np.log(2.0 * np.pi * sigma**2) - d.log_density[j]
                 # A match that speaks against the hypothesis is none: the star is missing and the detection false.
                 good = np.flatnonzero(gain > 0.0)
                 if len(good) < 2:
                     return None
                 _, information = step(p[i[good]] / f, residual[good], sigma[good], f, freedom)
-                total = log_odds(gain[good], i[good], len(seen)) + zero_point_price(d, len(i)) - np.log(scale)
+                total = (
+                    log_odds(gain[good], i[good], len(seen), d.vacancy) + zero_point_price(d, len(i)) - np.log(scale)
+                )
                 total += float(fit_volumes(information[None], freedom, self.volume)[0])
                 if turn_number == rounds:
                     stars = self.candidates[seen[i[good]]]
