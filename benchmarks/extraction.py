@@ -1,9 +1,7 @@
 """Time of star extraction on rendered frames: `python benchmarks/extraction.py`; beside sep where that is installed.
 
-"the next frame" knows the optics from the one before, "in 50 windows" also where stars are expected; at the end a whole solution, from
-the image to the attitude, by stages.
-
-CPU time and wall time of one call, the least and the median of many, because a shared processor only ever adds.
+"the next frame" knows the optics from the one before, "in 50 windows" also where stars are expected. At the end a whole
+solution, from the image to the attitude, by stages.
 """
 
 from __future__ import annotations

@@ -79,9 +79,10 @@ def detect_next(
     dark: np.ndarray | None = None,
     optics: Optics | None = None,
 ) -> tuple[Centroids, Optics | None]:
-    """As `detect`, with what the frame before told, and what this one tells: the same call for a sequence takes half the time.
+    """As `detect`, with what the frame before told, and what this one tells.
 
-    With optics only their scale is searched. Where its stars are few or of another width, the frame is searched as the first.
+    With optics no coarser scale than theirs is searched. Where stars are few or of another width, the frame is searched as
+    the first was.
     """
     s = settings or DetectionSettings()
     array, quantum = _prepared(image, dark)
@@ -165,11 +166,13 @@ def _prepared(image: Image, dark: np.ndarray | None) -> tuple[np.ndarray, float]
 def _at_scale(
     array: np.ndarray, image: Image, optics: Optics, s: DetectionSettings, quantum: float
 ) -> Centroids | None:
-    """Stars at the scale of known optics; None where they do not look like it."""
+    """Stars at the scales of known optics; None where they do not look like it."""
     level, binned = optics.level, array
-    for _ in range(level):
+    places = [_candidates(array, binned, 0, s, quantum)]
+    for k in range(1, level + 1):
         binned = halve(binned)
-    x, y, _, snr, floor = _merged([_candidates(array, binned, level, s, quantum)], s)
+        places.append(_candidates(array, binned, k, s, quantum))
+    x, y, _, snr, floor = _merged(places, s)
     if len(x) < _FEW:
         return None
     width, full = np.array(optics.width), array[y, x] >= 0.98 * image.saturation

@@ -128,8 +128,8 @@ class StarTracker:
         """Detect, identify and solve for the attitude: without a prior, or tracking from prior_q_SN (4,), good to prior_sigma
         (rad, per axis), with the whole sky as what remains where that fails. The solution does not contain the prior.
 
-        Of the frame before, `memory` keeps the width of the stars and the camera that was found: detection then searches one scale
-        only and, with a prior, only where the brightest stars are expected. Set it to None to forget.
+        Of the frame before, `memory` keeps the width of the stars and the camera that was found: detection then searches no
+        coarser scale than needed and, with a prior, only where the brightest stars are expected. Set it to None to forget.
 
         Raises ValueError for an image of another size than the camera's, and for a prior that means nothing.
         """
@@ -144,9 +144,16 @@ class StarTracker:
                 if found.solved:
                     self.memory = replace(last, camera=found.camera)
                     return found
-        centroids, optics = detect_next(image, self.detection, dark, None if last is None else last.optics)
+        known = None if last is None else last.optics
+        centroids, optics = detect_next(image, self.detection, dark, known)
         ms = {"detect": 1e3 * (time.perf_counter() - begin)}
         found = self.identified(centroids, *size, prior_q_SN, prior_sigma, ms)
+        if not found.solved and known is not None:  # what was remembered may be what was wrong
+            again = time.perf_counter()
+            centroids, optics = detect_next(image, self.detection, dark)
+            if len(centroids) != len(found.centroids) or optics != known:
+                ms = {"detect": ms["detect"] + 1e3 * (time.perf_counter() - again)}
+                found = self.identified(centroids, *size, prior_q_SN, prior_sigma, ms)
         self.memory = Memory(size, optics, found.camera if found.solved else None)
         return found
 
