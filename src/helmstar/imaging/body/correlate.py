@@ -16,11 +16,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.ndimage import correlate1d
 
 from ..camera import Camera
 from ..frame import Image
 from .moment import Centroid, offsets, preprocess, windowed_centroid
 from .photometry import Lambert, Law, McEwen
+from .shape import Ellipsoid
 from .target import (
     AMBIGUOUS,
     CUT,
@@ -41,11 +43,17 @@ COARSE_PX = 24.0
 """Diameter to which a large body is binned for the first fit."""
 FLOOR_PX, LAW_FLOOR_PX, LAW_FLOOR = 0.002, 0.006, 3e-5
 """1 sigma of what templates leave: of rendering, px, and of laws that the family comes near, px and per px of diameter."""
+STILL = 0.02
+"""A step that lowers the sum of squares by less, in units of the noise, is the last."""
 LAW_FREEDOM = 0.5
 """Prior sigma of each pattern of the family, over the flux of the law."""
 _STEPS = (np.diag([1.0, -1.0, 0.0]), np.array([[0, 1.0, 0], [1, 0, 0], [0, 0, 0]]), np.array([[0, 0, 1.0], [0, 0, 0], [1, 0, 0]]),
           np.array([[0, 0, 0], [0, 0, 1.0], [0, 1, 0]]), np.diag([-0.5, -0.5, 1.0]))  # fmt: skip
 _FINITE = 0.01
+# Of sixth order: the optics leave little light in what these get wrong, and much in what simple differences do.
+_SLOPE = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
+_BEND = np.array([2.0, -27.0, 270.0, -490.0, 270.0, -27.0, 2.0]) / 180.0
+_MORE = 3  # pixels around the window that they need
 
 
 @dataclass(frozen=True)
@@ -64,114 +72,171 @@ class Fit:
     psf_scale: float
 
 
-def fit(
-    data: Data, scene: Scene, start: Trial, detector: Detector, *, iterations: int = 8, still: float = 2e-3,
-    psf_scale: float = 1.0,
-) -> Fit:  # fmt: skip
-    """Gauss-Newton from a start, which should lie within about half of the body's radius."""
-    target = scene.target
-    law: Law = target.law or McEwen(weight=0.5)
-    with_family = not target.law_known
-    sigma_size = max(scene.pose.scale_sigma(target), 1e-4)
-    n_stretch = 5 if target.shape_sigma > 0.0 and hasattr(target.shape, "semi_axes") else 0
-    trial = replace(start, stretch=np.zeros((3, 3))) if n_stretch and start.stretch is None else start
-    stretches = np.zeros(5) if start.stretch is None or not n_stretch else _components(start.stretch)
-    log_size, log_psf = math.log(trial.size), math.log(psf_scale)
-    shot = 1.0 / detector.gain_e if detector.gain_e else 0.0
-    shot_known = detector.gain_e is not None
-    base_psf = scene.psf_sigma_px
-    converged, amounts = False, np.zeros(1)
-    A = np.eye(4)
-    chi2, snr, S = 1.0, 0.0, np.zeros((4, 4))
-    for step in range(iterations):
-        here = replace(scene, psf_sigma_px=base_psf * math.exp(0.5 * log_psf))
-        window = here.window(trial, 1.0)
-        grey, good, at = data.cut(window)
-        left, top, width, height = at
-        wide = (left - 1, top - 1, width + 2, height + 2)
-        images = here.draw(trial, wide, law=law, with_family=with_family)
-        size = max(float(images[0].sum()), 1e-12)
-        scales = np.array([size / max(float(i.sum()), 1e-12) for i in images])
-        patterns = [i * s for i, s in zip(images, scales)]
-        inner = [p[1:-1, 1:-1] for p in patterns]
-        y = np.where(good, grey, 0.0).ravel().astype(float)
-        ok = good.ravel().astype(float)
-        D = np.stack([p.ravel() for p in inner] + [np.ones(width * height)], axis=1) * ok[:, None]
-        level = max(float(D[:, 0] @ y) / max(float(D[:, 0] @ D[:, 0]), 1e-12), data.noise * 1e-3)
+class _Problem:
+    """The squares to be least: pixels of a window against patterns of light on a trial geometry, with priors.
+
+    geometry: (q,) x, y, log size, log psf variance and, where the figure is free, five stretches. Linear unknowns, the amounts of
+    patterns and the sky, are solved for at each geometry.
+    """
+
+    def __init__(self, data: Data, scene: Scene, start: Trial, detector: Detector, freedom: float, margin_px: float):
+        target = scene.target
+        self.scene, self.detector = scene, detector
+        self.law: Law = target.law or McEwen(weight=0.5)
+        self.with_family, self.freedom = not target.law_known, freedom
+        self.free = 5 if target.shape_sigma > 0.0 and isinstance(target.shape, Ellipsoid) else 0
+        self.sigma_size = max(scene.pose.scale_sigma(target), 1e-4)
+        grey, good, self.at = data.cut(scene.window(start, margin_px))
+        left, top, width, height = self.at
+        self.wide = (left - _MORE, top - _MORE, width + 2 * _MORE, height + 2 * _MORE)
+        self.ok = good.ravel().astype(float)
+        self.y = np.where(good, grey, 0.0).ravel().astype(float)
+        self.noise = data.noise
+        self.w = self.ok / data.noise**2
+        self.shot = 1.0 / detector.gain_e if detector.gain_e else 0.0
+        spread = [self.sigma_size, 2.0 * detector.psf_spread, *[max(target.shape_sigma, 1e-6)] * self.free]
+        self.prior = np.concatenate([[0.0, 0.0], 1.0 / np.square(spread)])
+        stretches = [] if not self.free else [0.0] * 5 if start.stretch is None else list(_components(start.stretch))
+        self.scales: np.ndarray | None = None
+        self.level: float | None = None
+        self.start = np.array([*start.centre_px, math.log(start.size), 0.0, *stretches])
+
+    def trial(self, p: np.ndarray) -> Trial:
+        stretch = np.einsum("k,kij->ij", p[4:], np.array(_STEPS)) if self.free else None
+        return Trial(p[:2], math.exp(p[2]), stretch)
+
+    def _scene(self, p: np.ndarray) -> Scene:
+        return replace(self.scene, psf_sigma_px=self.scene.psf_sigma_px * math.exp(0.5 * p[3]))
+
+    def solve(self, p: np.ndarray) -> _State:
+        """The best linear unknowns at a geometry, and the cost."""
+        height, width = self.at[3], self.at[2]
+        images = self._scene(p).draw(self.trial(p), self.wide, law=self.law, with_family=self.with_family)
+        if self.scales is None:  # of equal flux at the start; if they changed by geometry, so would the prior
+            size = max(float(images[0].sum()), 1e-12)
+            self.scales = np.array([size / max(float(i.sum()), 1e-12) for i in images])
+        scales = self.scales
+        D = np.empty((height * width, len(images) + 1))
+        for k, (i, s) in enumerate(zip(images, scales)):
+            D[:, k] = (s * i[_MORE:-_MORE, _MORE:-_MORE]).ravel() * self.ok
+        D[:, -1] = self.ok
+        if self.level is None:
+            self.level = max(float(D[:, 0] @ self.y) / max(float(D[:, 0] @ D[:, 0]), 1e-12), self.noise * 1e-3)
         # Sky is known from the whole frame; here it may be a little off, as stray light has it.
-        linear = np.concatenate(
-            [[0.0], np.full(len(patterns) - 1, 1.0 / (LAW_FREEDOM * level) ** 2), [1.0 / data.noise**2]]
-        )
-        variance = data.noise**2
-        if step and shot > 0.0:
-            variance = data.noise**2 + shot * np.maximum(D[:, :-1] @ amounts, 0.0)
-        w = ok / variance
-        Dw = D * np.asarray(w)[:, None] if np.ndim(w) else D * w
-        found = np.linalg.solve(Dw.T @ D + np.diag(linear + 1e-15), Dw.T @ y)
-        amounts = found[:-1]
-        model = sum(a * p for a, p in zip(amounts, patterns))
-        rest = y - (D @ found)
-        m = model[1:-1, 1:-1]
-        gx = 0.5 * (model[1:-1, 2:] - model[1:-1, :-2])
-        gy = 0.5 * (model[2:, 1:-1] - model[:-2, 1:-1])
-        dx = np.arange(left, left + width) - trial.centre_px[0]
-        dy = np.arange(top, top + height) - trial.centre_px[1]
-        around = model[2:, 1:-1] + model[:-2, 1:-1] + model[1:-1, 2:] + model[1:-1, :-2] - 4.0 * m
+        loose = np.full(len(images) - 1, 1.0 / (self.freedom * self.level) ** 2)
+        prior = np.concatenate([[0.0], loose, [1.0 / self.noise**2]])
+        Dw = D * self.w[:, None]
+        found = np.linalg.solve(Dw.T @ D + np.diag(prior + 1e-15), Dw.T @ self.y)
+        rest = self.y - D @ found
+        cost = float(self.w @ rest**2 + prior @ found**2 + self.prior[2:] @ p[2:] ** 2)
+        model = np.einsum("k,kij->ij", found[:-1] * scales, np.array(images))
+        return _State(p, D, Dw, found, prior, rest, cost, model, scales)
+
+    def weigh(self, s: _State) -> None:
+        """Weights by the light of a state; how noisy light is comes from its residuals where the detector does not say."""
+        light = np.maximum(s.D[:, :-1] @ s.found[:-1], 0.0)
+        if self.detector.gain_e is None:
+            excess = (s.rest**2 - self.noise**2 * self.ok) @ light / max(float(light @ light), 1e-300)
+            self.shot = max(float(excess), 0.0)
+        self.w = self.ok / (self.noise**2 + self.shot * light)
+
+    def jacobian(self, s: _State) -> np.ndarray:
+        """(pixels, q): change of the model by geometry."""
+        left, top, width, height = self.at
+        m, p = s.model, s.p
+        inner = (slice(_MORE, -_MORE), slice(_MORE, -_MORE))
+        gx, gy = (correlate1d(m, _SLOPE, axis=k)[inner] for k in (1, 0))
+        dx, dy = np.arange(left, left + width) - p[0], np.arange(top, top + height) - p[1]
+        around = (correlate1d(m, _BEND, axis=0) + correlate1d(m, _BEND, axis=1))[inner]
+        here = self._scene(p)
         columns = [-gx, -gy, -(dx[None, :] * gx + dy[:, None] * gy), 0.5 * around * here.psf_sigma_px**2]
-        if n_stretch:
-            weights = amounts * scales
-            base = here.draw(trial, at, law=law, with_family=with_family, weights=weights)[0]
-            for E in _STEPS:
-                moved = replace(trial, stretch=np.asarray(trial.stretch) + _FINITE * E)
-                columns.append(
-                    (here.draw(moved, at, law=law, with_family=with_family, weights=weights)[0] - base) / _FINITE
-                )
-        J = np.concatenate([np.stack([c.ravel() for c in columns], axis=1) * ok[:, None], D], axis=1)
-        q = 4 + n_stretch
-        if not shot_known and step:
-            light = np.maximum(m.ravel(), 0.0) * ok
-            shot = max(float(((rest**2 - data.noise**2) * light).sum() / max(float(light @ light), 1e-12)), 0.0)
-        prior = np.concatenate([
-            [0.0, 0.0, 1.0 / sigma_size**2, 1.0 / (2.0 * detector.psf_spread) ** 2],
-            np.full(n_stretch, 1.0 / max(target.shape_sigma, 1e-6) ** 2), linear,
-        ])  # fmt: skip
-        state = np.concatenate([[0.0, 0.0, log_size, log_psf], stretches[:n_stretch], found])
-        expected = np.zeros(len(state))
-        Jw = J * np.asarray(w)[:, None]
-        A = Jw.T @ J + np.diag(prior + 1e-15)
-        g = Jw.T @ rest + prior * (expected - state)
-        move = np.linalg.solve(A, g)
-        degrees = max(float(ok.sum()) - q - len(found), 1.0)
-        chi2 = float((w * rest**2).sum()) / degrees
-        snr = float(amounts @ (D[:, :-1].T @ (w * y))) / math.sqrt(
-            max(float(((D[:, :-1] @ amounts) ** 2 * w).sum()), 1e-300)
-        )
-        S = _misfit(Jw * rest[:, None], height, width, max(4, round(0.12 * scene.diameter_px())))
-        limit = 0.25 * scene.diameter_px(trial.size) + 0.5
-        length = float(np.hypot(*move[:2]))
-        if length > limit:
-            move *= limit / length
-        move[2] = np.clip(move[2], -0.25, 0.25)
-        move[3] = np.clip(move[3], -0.5, 0.5)
-        log_size = float(np.clip(log_size + move[2], -1.5, 1.5))
-        log_psf = float(np.clip(log_psf + move[3], -1.5, 1.5))
-        if n_stretch:
-            stretches = np.clip(stretches + np.clip(move[4:q], -0.1, 0.1), -0.6, 0.6)
-        stretch = sum(s * E for s, E in zip(stretches, _STEPS)) if n_stretch else None
-        trial = Trial(trial.centre_px + move[:2], math.exp(log_size), None if stretch is None else np.asarray(stretch))
-        if not np.isfinite(trial.centre_px).all():
-            break
-        sigma = math.sqrt(max(np.linalg.inv(A)[0, 0], 0.0))
-        if length < max(still, 0.05 * sigma) and abs(move[2]) < 1e-3 + 0.05 * sigma_size and (step or iterations == 1):
-            converged = True
-            break
-    C = np.linalg.inv(A)
+        if self.free:
+            weights = s.found[:-1] * s.scales
+            draw = lambda p: here.draw(  # noqa: E731
+                self.trial(p), self.at, law=self.law, with_family=self.with_family, weights=weights
+            )[0]
+            base = draw(p)
+            columns += [(draw(p + _FINITE * e) - base) / _FINITE for e in np.eye(len(p))[4:]]
+        return np.stack([c.ravel() for c in columns], axis=1) * self.ok[:, None]
+
+
+@dataclass(frozen=True)
+class _State:
+    """A geometry p with its design D (pixels, patterns and sky) and Dw weighted, linear unknowns found, their prior, residuals,
+    cost, model image with _MORE pixels more on each side, and the scales of the patterns."""
+
+    p: np.ndarray
+    D: np.ndarray
+    Dw: np.ndarray
+    found: np.ndarray
+    prior: np.ndarray
+    rest: np.ndarray
+    cost: float
+    model: np.ndarray
+    scales: np.ndarray
+
+
+def fit(
+    data: Data, scene: Scene, start: Trial, detector: Detector, *, iterations: int = 50, freedom: float = LAW_FREEDOM,
+    margin_px: float = 2.0,
+) -> Fit:  # fmt: skip
+    """Levenberg and Marquardt's least squares from a start, which should lie within about half of the body's radius.
+
+    freedom: prior sigma of the family's patterns. margin_px: by how much the window is wider than the body at the start.
+    """
+    problem = _Problem(data, scene, start, detector, freedom, margin_px)
+    state = problem.solve(problem.start)
+    problem.weigh(state)
+    state = problem.solve(problem.start)
+    damping, converged, fresh, weighed = 1e-3, False, True, False
+    A, J, g = np.eye(1), np.zeros((1, 1)), np.zeros(1)
+    diameter = scene.diameter_px()
+    most = np.array([0.25 * diameter + 0.5] * 2 + [0.2, 0.5] + [0.1] * problem.free)
+    for _ in range(iterations):
+        if fresh:
+            J = problem.jacobian(state)
+            Jw = J * problem.w[:, None]
+            cross = Jw.T @ state.D
+            # The linear unknowns follow the geometry: what they take up of its columns is no information on it.
+            inner = np.linalg.inv(state.Dw.T @ state.D + np.diag(state.prior + 1e-15))
+            A = Jw.T @ J + np.diag(problem.prior) - cross @ inner @ cross.T
+            g = Jw.T @ state.rest - problem.prior * state.p
+            fresh = False
+        move = np.linalg.solve(A + np.diag(damping * np.diagonal(A) + 1e-12), g)
+        move /= max(1.0, float(np.max(np.abs(move) / most)))
+        p = state.p + move
+        p[2:4] = np.clip(p[2:4], -1.5, 1.5)
+        p[4:] = np.clip(p[4:], -0.6, 0.6)
+        tried = problem.solve(p)
+        unit = max(1.0, state.cost / max(float(problem.ok.sum()), 1.0))
+        less = (state.cost - tried.cost) / unit
+        if less >= 0.0:
+            state, fresh, damping = tried, True, max(damping / 10.0, 1e-7)
+        else:
+            damping = max(10.0 * damping, 1e-2)
+        # What a step of Newton's length would gain is below what noise leaves, or steps that small gain nothing.
+        if abs(less) < STILL or damping > 1e3:
+            if weighed:
+                converged = damping <= 1e3 or float(g @ np.linalg.solve(A, g)) < 9.0 * unit
+                break
+            problem.weigh(state)
+            state, weighed, fresh, damping = problem.solve(state.p), True, True, 1e-3
+    return _outcome(problem, state, J if not fresh else problem.jacobian(state), converged)
+
+
+def _outcome(problem: _Problem, s: _State, J: np.ndarray, converged: bool) -> Fit:
+    q = len(s.p)
+    K = np.concatenate([J, s.D], axis=1)
+    Kw = K * problem.w[:, None]
+    C = np.linalg.inv(Kw.T @ K + np.diag(np.concatenate([problem.prior, s.prior]) + 1e-15))
+    chi2 = float(problem.w @ s.rest**2) / max(float(problem.ok.sum()) - K.shape[1], 1.0)
+    side = max(4, round(0.12 * problem.scene.diameter_px()))
     # Residuals that go together over patches are no noise: the sandwich of what each patch pulls says how much they move the fit.
-    more = C @ S @ C
-    excess = _positive(more - C)
-    q = 4 + n_stretch
-    C = C[:q, :q] * max(1.0, chi2) + excess[:q, :q]
-    return Fit(trial, C, chi2, amounts, snr, converged, shot, math.exp(log_psf))
+    more = C @ _misfit(Kw * s.rest[:, None], problem.at[3], problem.at[2], side) @ C
+    C = (C * max(1.0, chi2) + _positive(more - C))[:q, :q]
+    light = s.D[:, :-1] @ s.found[:-1]
+    snr = float(light @ (problem.w * (s.rest + light))) / math.sqrt(max(float(problem.w @ light**2), 1e-300))
+    return Fit(problem.trial(s.p), C, chi2, s.found[:-1], snr, converged, problem.shot, math.exp(s.p[3]))
 
 
 def _components(S: np.ndarray) -> np.ndarray:
@@ -192,6 +257,12 @@ def _positive(M: np.ndarray) -> np.ndarray:
     d = np.sqrt(np.maximum(np.abs(np.diagonal(M)), 1e-300))
     value, vector = np.linalg.eigh(0.5 * (M + M.T) / np.outer(d, d))
     return (vector * np.maximum(value, 0.0)) @ vector.T * np.outer(d, d)
+
+
+def coarse_fit(data: Data, scene: Scene, start: Trial, detector: Detector) -> Fit:
+    """A fit of a binned frame: patterns stay near the law, and how noisy light is comes from the residuals."""
+    size = 0.5 * scene.diameter_px() * min(3.0 * scene.pose.scale_sigma(scene.target), 0.6)
+    return fit(data, scene, start, replace(detector, gain_e=None), freedom=0.2, margin_px=3.0 + size, iterations=15)
 
 
 def place(data: Data, scene: Scene, around: np.ndarray | None, reach_px: float) -> tuple[np.ndarray, float] | None:
@@ -233,7 +304,8 @@ def centre_from_fit(
     corner: tuple[int, int] = (0, 0), centroid: Centroid | None = None,
 ) -> FigureCentre:  # fmt: skip
     """Centre of figure by correlation and fit. corner: the frame's pixel that the image's (0, 0) is. centroid: of the same
-    image, if it was measured already. A body cut by the edge or with full pixels is fitted by what is there, and its status says so."""
+    image, if it was measured already. A body cut by the edge or with full pixels is fitted by what is there, and its status
+    says so."""
     detector = detector or Detector()
     scene = Scene(camera, target, pose, detector.psf_sigma_px)
     diameter = scene.diameter_px()
@@ -253,7 +325,6 @@ def centre_from_fit(
         )
     start = Trial(centroid.xy_px - offset)
     n = max(1, round(diameter / COARSE_PX))
-    psf_scale = 1.0
     if n > 1 or centroid.status in (CUT, SATURATED):
         coarse, small = data.binned(n), scene.binned(n)
         to = lambda xy: (xy - (n - 1) / 2) / n  # noqa: E731
@@ -263,10 +334,11 @@ def centre_from_fit(
             if found is not None:
                 there = Trial(found[0])
         if n > 1:
-            first = fit(coarse, small, there, replace(detector, gain_e=None), still=0.02)
-            there = first.trial
+            there = coarse_fit(coarse, small, there, detector).trial
         start = Trial(there.centre_px * n + (n - 1) / 2, there.size, there.stretch)
-    result = fit(data, scene, start, detector, psf_scale=psf_scale)
+    # Templates on large pixels are right within a few hundredths of these; a body that was not binned may be of any size.
+    margin = 2.0 + (0.03 * diameter if n > 1 else 0.5 * diameter * min(2.0 * pose.scale_sigma(target), 0.5))
+    result = fit(data, scene, start, detector, margin_px=margin)
     xy, C = result.trial.centre_px, result.covariance[:2, :2]
     C = C + np.eye(2) * (FLOOR_PX**2 + (0.0 if target.law_known else LAW_FLOOR_PX**2 + (LAW_FLOOR * diameter) ** 2))
     status, message = FOUND, ""

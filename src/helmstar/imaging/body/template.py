@@ -23,7 +23,7 @@ MESH_RAYS = 300.0
 
 @dataclass(frozen=True)
 class Trial:
-    """centre_px: (2,). size: apparent over expected. stretch: (3, 3) symmetric S without trace, in C: the body drawn out by I + S."""
+    """centre_px: (2,). size: apparent over expected. stretch: (3, 3) symmetric S without trace, in C: drawn out by I + S."""
 
     centre_px: np.ndarray
     size: float = 1.0
@@ -71,9 +71,14 @@ class Scene:
         """Images (height, width) of the law and of each of the family, after the optics; their sum by `weights` if given."""
         left, top, width, height = window
         small = self.diameter_px(trial.size)
-        per_px = int(np.clip(math.ceil(max(1.2 / max(self.psf_sigma_px, 0.3), 60.0 / small)), 1, 8))
-        if small > 60.0:
-            per_px = 1
+        # The rim's quadrature is right at any size of cells: these only have to sample optics and shading.
+        per_px = (
+            int(np.clip(math.ceil(max(1.2 / max(self.psf_sigma_px, 0.3), 30.0 / small)), 1, 8))
+            if small < 40
+            else 2
+            if small < 100
+            else 1
+        )
         blur = math.ceil(_REACH * self.psf_sigma_px) + 1
 
         def shade(mu0: np.ndarray, mu: np.ndarray, alpha: np.ndarray | float) -> list[np.ndarray]:
