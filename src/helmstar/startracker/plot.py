@@ -61,20 +61,23 @@ def draw_residuals(
     pen = ImageDraw.Draw(picture)
     for n, (name, (xy, residual)) in enumerate((("before", before), ("after", after))):
         left, top = 20 + n * (width + 20), 40
-        pen.rectangle((left, top, left + width, top + height), outline=(90, 96, 110))
         length = np.hypot(residual[:, 0], residual[:, 1])
         longest = max(float(np.percentile(length, 90)), 1e-6) if len(length) else 1.0
-        enlarged = 30.0 / (longest * scale)
-        for (x, y), (dx, dy) in zip(xy, residual):
-            a, b = left + (x + 0.5) * scale, top + (y + 0.5) * scale
-            pen.ellipse((a - 1.5, b - 1.5, a + 1.5, b + 1.5), fill=FOUND)
-            pen.line((a, b, a + dx * scale * enlarged, b + dy * scale * enlarged), fill=MATCHED if n else WRONG)
+        enlarged = 30.0 / longest
+        panel = Picture.new("RGB", (width, height), (16, 18, 24))
+        lines = ImageDraw.Draw(panel)
+        for (x, y), (dx, dy) in zip((xy + 0.5) * scale, residual * enlarged):
+            lines.ellipse((x - 1.5, y - 1.5, x + 1.5, y + 1.5), fill=FOUND)
+            lines.line((x, y, x + dx, y + dy), fill=MATCHED if n else WRONG)
+        lines.rectangle((0, 0, width - 1, height - 1), outline=(90, 96, 110))
+        picture.paste(panel, (left, top))
         rms = float(np.sqrt(np.mean(residual**2))) if len(length) else 0.0
         pen.text((left, 16), f"{name}: {rms:.3g} px rms per axis, {len(xy)} stars", fill=(255, 255, 255))
-        bar = 10.0 ** np.floor(np.log10(longest))
-        reach = bar * scale * enlarged
-        pen.line((left, top + height + 16, left + reach, top + height + 16), fill=(255, 255, 255), width=2)
-        pen.text((left + reach + 8, top + height + 10), f"{bar:.3g} px", fill=(255, 255, 255))
+        step = 10.0 ** np.floor(np.log10(longest))
+        bar = step * max(k for k in (1, 2, 5) if k * step <= longest * 1.001)
+        reach = left + bar * enlarged
+        pen.line((left, top + height + 16, reach, top + height + 16), fill=(255, 255, 255), width=2)
+        pen.text((reach + 8, top + height + 10), f"{bar:.3g} px", fill=(255, 255, 255))
     path.parent.mkdir(parents=True, exist_ok=True)
     picture.save(path)
     return path
