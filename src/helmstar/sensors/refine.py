@@ -112,7 +112,7 @@ def refine(
     start = replace(camera, focal_px=found.focal_px)
     lens = _Lens.of(camera, prior)
     R, p = matrix_of_quaternion(found.q_SN), np.array([np.log(found.focal_px / camera.focal_px), 0.0, 0.0, 0.0])
-    near = _in_view(sky, R[2], start)
+    near = _in_view(sky, R, start)
     at = np.minimum(np.searchsorted(near, found.stars), len(near) - 1)
     good = near[at] == found.stars if len(near) else np.zeros(len(at), bool)
     i, j = at[good], found.detections[good]
@@ -163,10 +163,13 @@ def refine(
     return Refined(better, fitted, best.scale)
 
 
-def _in_view(sky: Sky, boresight: np.ndarray, camera: Camera) -> np.ndarray:
-    """Indices of the stars within a tenth more than the camera's half diagonal of a direction (3,)."""
-    radius = 0.55 * float(np.hypot(camera.width, camera.height * camera.aspect)) / camera.focal_px
-    return np.flatnonzero(sky.directions @ boresight > np.cos(np.arctan(radius)))
+def _in_view(sky: Sky, R: np.ndarray, camera: Camera) -> np.ndarray:
+    """Indices of the stars that a pinhole at R sees on the image and a margin of 4% around it."""
+    half = np.array([camera.width, camera.height * camera.aspect]) * (0.54 / camera.focal_px)
+    near = np.flatnonzero(sky.directions @ R[2] > np.cos(np.arctan(np.hypot(*half))))
+    v = sky.directions[near] @ R.T
+    offset = (np.array([camera.width - 1, camera.height - 1]) / 2 - [camera.cx, camera.cy]) * [1.0, camera.aspect]
+    return near[(np.abs(v[:, :2] - v[:, 2:] * offset / camera.focal_px) < half * v[:, 2:]).all(axis=1)]
 
 
 @dataclass(frozen=True)
