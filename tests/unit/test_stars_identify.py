@@ -10,9 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from helmstar.attitude import quest
-from helmstar.stars import Pinhole, Sky, default_sky, identify, load_catalog, patterns, track
+from helmstar.stars import Pinhole, Sky, default_sky, identify, identify_stated, load_catalog, patterns, track
+from helmstar.stars.hypotheses import levels_for
+from helmstar.stars.identify import focal_freedom, prepare
 from helmstar.stars.pinhole import ideal_pixels, image_pixels
+from helmstar.stars.screen import raster, screen
 from helmstar.stars.synthetic import random_scene, scene
+from helmstar.stars.verify import verify
 
 
 def camera(fov_deg: float, aspect: float = 1.0) -> Pinhole:
@@ -238,3 +242,43 @@ def test_a_sky_of_another_year_has_moved_stars():
     old, new = Sky(load_catalog(6.0), 2000.0), Sky(load_catalog(6.0), 2025.0)
     moved = np.linalg.norm(old.directions - new.directions, axis=1)
     assert np.degrees(moved.max()) * 3600 > 80
+
+
+@pytest.mark.parametrize("wrong", [-0.05, 0.03])
+def test_a_field_stated_wrongly_is_found(wrong):
+    """A calibrated camera's prior excludes it; a statement of a field does not."""
+    true, stated = camera(14), camera(14 * (1.0 + wrong))
+    s = scene(default_sky(), true, np.random.default_rng(14), false=5)
+    assert not identify(s.xy_px, stated, flux=s.flux, sigma_px=0.3, work=100_000).solved
+    found = identify_stated(s.xy_px, stated, flux=s.flux, sigma_px=0.3, focal_sigma=0.005)
+    assert found.solved
+    assert found.focal_px == pytest.approx(true.focal_px, rel=2e-3)
+    assert (found.stars == s.star[found.detections]).all()
+
+
+def test_a_search_ends_when_the_next_pair_is_not_worth_it():
+    """Fewer catalogue pairs for few detections, and never as many as it may look at."""
+    c, work = camera(12), []
+    for n in (5, 12, 60):
+        s = random_scene(c, np.random.default_rng([15, n]), n)
+        work.append(identify(s.xy_px, c, flux=s.flux, sigma_px=0.3).work)
+    assert work[0] < work[1] < 2 * work[2]
+    assert max(work) < 1_500_000
+
+
+def test_screening_agrees_with_verification():
+    """At the truth's neighbourhood both find the sky; far from it neither does."""
+    c, sky = camera(14), default_sky()
+    s = scene(sky, c, np.random.default_rng(16), false=20, noise_px=0.5)
+    d, _ = prepare(s.xy_px, c, s.flux, None, 0.5, 0.4, None)
+    freedom = focal_freedom(c, None, 0.001)
+    level = levels_for(d, freedom, patterns.LADDER)[0][0]
+    off = Rotation.from_rotvec([[0, 0, 0], [5e-4, -5e-4, 2e-3], [0.3, 0, 0]]).as_matrix()
+    R, f = off @ s.R_SN, np.full(3, c.focal_px)
+    odds, stepped, _ = screen(sky, level, d, raster(d), R, f, freedom)
+    fit = verify(sky, level, d, s.R_SN, c.focal_px, freedom)
+    assert fit is not None
+    assert odds[:2] == pytest.approx(fit.log_odds, abs=0.2 * fit.log_odds)
+    assert odds[2] < 0.0
+    # One step leads from 2 mrad to a tenth of a pixel or so.
+    assert np.abs(stepped[0] - stepped[1]).max() < 1e-4

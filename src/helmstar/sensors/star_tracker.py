@@ -23,7 +23,7 @@ from ..imaging import Camera, Centroids, DetectionSettings, Image
 from ..imaging.calibrated import Calibrated
 from ..imaging.detect import Optics, detect_near, detect_next
 from ..stars.catalog import Catalog, load_catalog
-from ..stars.identify import LIMIT, Identification, identify, matrix_of_quaternion, unit_quaternion
+from ..stars.identify import LIMIT, Identification, identify, identify_stated, matrix_of_quaternion, unit_quaternion
 from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
 from ..stars.track import WIDEST_PX, track
@@ -195,6 +195,13 @@ class StarTracker:
                 sigma_px=centroids.covariance_px, focal_sigma=focal_sigma, q_SB=self.q_SB, sky=self.sky, limit=self.limit,
                 fall_back=fall_back,
             )  # fmt: skip
+        elif self.camera is None and fov_range is None:
+            found = identify_stated(
+                centroids.xy_px + 0.5, eye, flux=centroids.flux, sigma_px=centroids.covariance_px,
+                focal_sigma=focal_sigma, q_SB=self.q_SB, sky=self.sky, limit=self.limit,
+            )  # fmt: skip
+            if found.solved and abs(found.focal_px / camera.focal_px - 1.0) > 5.0 * focal_sigma:
+                fov_range = (0.0, math.pi)  # the statement was wrong: the fit must not lean on it
         else:
             found = identify(
                 centroids.xy_px + 0.5, eye, flux=centroids.flux, sigma_px=centroids.covariance_px, fov_range=fov_range,

@@ -4,9 +4,20 @@ For lists of centroids as plain arrays; docs/stars.md says how it works. No JAX 
 """
 
 from .catalog import Catalog, load_catalog
-from .identify import Identification, default_sky, identify
+from .identify import Identification, default_sky, identify, identify_stated
 from .patterns import Sky
 from .pinhole import Camera, Pinhole
 from .track import track
 
-__all__ = ["Camera", "Catalog", "Identification", "Pinhole", "Sky", "default_sky", "identify", "load_catalog", "track"]
+__all__ = [
+    "Camera",
+    "Catalog",
+    "Identification",
+    "Pinhole",
+    "Sky",
+    "default_sky",
+    "identify",
+    "identify_stated",
+    "load_catalog",
+    "track",
+]
