@@ -238,6 +238,29 @@ Exit code: 0 all images were used, 2 some were not, 1 misuse or too few stars.""
     c.set_defaults(call=_calibrate)
 
     c = sub.add_parser(
+        "opnav",
+        help="centres of a target body in frames, and the probe's trajectory relative to it",
+        description="""Find the centre of figure of a body in frames (FITS or images) with its covariance, and the probe's
+trajectory relative to the body. Times are those of FITS headers, or of a table with the columns file and time_utc or time_s among the
+frames. The attitude is a table as `helmstar attitude` writes it. Exit code: 0 all centres found, 2 some not, 1 misuse.""",
+        epilog="""examples:
+  helmstar opnav frames/*.fits --camera cam.toml --attitude attitude.parquet --body body.toml
+  helmstar opnav frames.csv --camera cam.toml --attitude attitude.parquet --body body.toml --json --out nav""",
+        formatter_class=raw,
+    )
+    c.misuse = 1
+    c.add_argument("files", nargs="+", metavar="FRAME", help="frames of the body, and tables of their times")
+    c.add_argument("--camera", required=True, metavar="TOML", help="camera, its mounting and detector (docs/opnav.md)")
+    c.add_argument("--attitude", required=True, metavar="TABLE", help="attitude.parquet or .csv of the probe")
+    c.add_argument("--body", required=True, metavar="TOML", help="the body, the Sun, where the probe is expected")
+    c.add_argument(
+        "--method", default="auto", metavar="M", help="moment, fit, limb, or auto by apparent size (default)"
+    )
+    c.add_argument("--no-plots", action="store_true", help="write no drawing of each frame")
+    _common(c, "helmstar-out/opnav-BODY")
+    c.set_defaults(call=_opnav)
+
+    c = sub.add_parser(
         "allan",
         help="Allan deviation of gyro data: angle random walk, rate random walk, bias instability",
         description="Allan deviation of gyro data with fitted noise parameters, printed as a [gyro] table for sensors.toml.",
@@ -470,6 +493,27 @@ def _calibrate(args: argparse.Namespace) -> int:
     else:
         print_calibrated(result)
     return 0 if all(e["status"] == "used" for e in result["images"]) else 2
+
+
+def _opnav(args: argparse.Namespace) -> int:
+    from .opnav.command import OpnavOptions, print_opnav, run_opnav
+
+    folder = Path(args.out or Path("helmstar-out") / f"opnav-{Path(args.body).stem or 'body'}")
+    options = OpnavOptions(
+        camera=Path(args.camera),
+        attitude=Path(args.attitude),
+        body=Path(args.body),
+        folder=folder,
+        method=args.method,
+        plots=not args.no_plots,
+        command=_command(args),
+    )
+    result = run_opnav([Path(f) for f in args.files], options)
+    if args.json:
+        _print_json(result)
+    else:
+        print_opnav(result)
+    return 0 if all(e["status"] == "found" for e in result["frames"]) else 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:

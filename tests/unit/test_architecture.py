@@ -15,7 +15,7 @@ FLOORS = {
     "core": 1, "attitude": 1, "astro": 1, "imaging": 1,
     "stars": 2, "filters": 2, "models": 2, "evaluate": 2,
     "sensors": 3, "io": 3,
-    "scenarios": 4, "telemetry": 4, "startracker": 4,
+    "scenarios": 4, "telemetry": 4, "startracker": 4, "opnav": 4,
     "campaign": 5, "report": 5,
     "cli": 6, "__main__": 7, "__init__": -3,
 }  # fmt: skip

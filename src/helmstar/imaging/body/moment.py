@@ -302,7 +302,9 @@ def centre_of_centroid(c: Centroid, camera: Camera, target: Target, pose: Pose) 
             )
         centre = c.xy_px - offset
     sigma = pose.scale_sigma(target)
-    return FigureCentre(FOUND, "moment", centre, c.covariance_px + C, c.xy_px, diameter, 1.0, sigma)
+    return FigureCentre(
+        FOUND, "moment", centre, c.covariance_px + C, c.xy_px, diameter, 1.0, sigma, message=c.message, common_px=C
+    )
 
 
 __all__ = [

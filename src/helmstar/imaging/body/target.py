@@ -88,7 +88,8 @@ class FigureCentre:
 
     centre_px: (2,) where the body's centre is seen, px of the frame. covariance_px: (2, 2), px^2, with what is not known of radius,
     law and shape. centroid_px: (2,) brightness centroid. size: apparent over expected diameter, with size_sigma. limb_px: (n, 2)
-    edge points that were used. chi2: of the fit's residuals per degree of freedom. message: why the status is what it is.
+    edge points that were used. chi2: of the fit's residuals per degree of freedom. message: why the status is what it
+    is. common_px: (2, 2), the part of the covariance that frames of the same body share, px^2.
     """
 
     status: str
@@ -102,6 +103,7 @@ class FigureCentre:
     limb_px: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
     chi2: float = float("nan")
     message: str = ""
+    common_px: np.ndarray = field(default_factory=lambda: np.zeros((2, 2)))
 
     @property
     def usable(self) -> bool:

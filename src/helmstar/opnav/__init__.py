@@ -1,0 +1,1 @@
+"""Optical navigation by frames of a target body: `helmstar opnav`."""
