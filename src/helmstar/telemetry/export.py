@@ -50,7 +50,8 @@ def write_exports(
     time, q_BN = solution.timeline.time, solution.smoothed.q_BN
     restarts = solution.updates.index[solution.updates.status == RESET]
     parts = _segments(time, restarts)
-    comments = ["Attitude estimated by helmstar from gyro and star tracker telemetry, smoothed.", command]
+    source = "gyro and star tracker telemetry" if len(solution.gyro) else "star tracker telemetry"
+    comments = [f"Attitude estimated by helmstar from {source}, smoothed.", command]
     if aem:
         from ..io.aem import write_aem
 
