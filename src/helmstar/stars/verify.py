@@ -130,11 +130,9 @@ class Freedom:
 def jacobian(u: np.ndarray, f: float) -> np.ndarray:
     """Derivative (k, 2, 4) of ideal pixels by (theta, ln f) at u (k, 2) = (X/Z, Y/Z), R = exp([theta x]) R_hat."""
     x, y = u[:, 0], u[:, 1]
-    one = np.ones_like(x)
-    J = np.empty((len(u), 2, 4))
-    J[:, 0, 0], J[:, 0, 1], J[:, 0, 2], J[:, 0, 3] = -x * y, one + x * x, -y, x
-    J[:, 1, 0], J[:, 1, 1], J[:, 1, 2], J[:, 1, 3] = -(one + y * y), x * y, x, y
-    return f * J
+    xy, one = x * y, np.ones_like(x)
+    rows = (-xy, one + x * x, -y, x, -one - y * y, xy, x, y)
+    return (f * np.array(rows)).T.reshape(-1, 2, 4)
 
 
 def turn(theta: np.ndarray, R: np.ndarray) -> np.ndarray:
@@ -195,14 +193,17 @@ def nearest_pairs(p: np.ndarray, d: Detections, gate_px: np.ndarray, excess: np.
 
     excess: (S, n) added to the squared distance over sigma, for magnitudes that disagree.
     """
-    delta = p[:, None, :] - d.xy[None, :, :]
-    square = delta[..., 0] ** 2 + delta[..., 1] ** 2
-    cost = square / d.sigma**2
-    if excess is not None:
-        cost = cost + excess
-    cost[square > gate_px**2] = np.inf
-    if cost.size == 0:
+    if len(p) == 0 or len(d) == 0:
         return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
+    square = p[:, :1] - d.xy[:, 0]
+    square *= square
+    dy = p[:, 1:] - d.xy[:, 1]
+    dy *= dy
+    square += dy
+    cost = np.multiply(square, d.sigma**-2.0, out=dy)
+    if excess is not None:
+        cost += excess
+    np.copyto(cost, np.inf, where=square > gate_px**2)
     j = cost.argmin(axis=1)
     rows = np.arange(len(p))
     good = np.isfinite(cost[rows, j]) & (cost.argmin(axis=0)[j] == rows)
