@@ -380,6 +380,8 @@ def test_gamma_noise_is_what_its_density_says():
     model = relative_model(MOTION, CAMERA)
     x, _ = _state(0)
     n, noise, p = 40_000, model.process.noise, model.process.params
+    assert noise.sample is not None
+    assert noise.logpdf is not None
     dt = jnp.asarray(10.0)
     w = np.asarray(jax.vmap(lambda k: noise.sample(p, x, None, dt, k))(jax.random.split(KEY, n)))
     scale = 10.0 / np.sqrt(3.0)

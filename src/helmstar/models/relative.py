@@ -9,9 +9,9 @@
 | K | focal length in pixels, with cross terms | (2, 3) px |
 | p0 | pixel and line of the boresight | (2,) px |
 
-    (8)      r' = r + v dt + w,   the mean of w known and in the step
+    (8)      r' = r + v dt + w,   the mean of w known and in the step;   s' = s + u w_s
     (4)(5)   u_C = R_CB R_BN (-r),   x = u_x / u_z, y = u_y / u_z
-    (6)      [p; l] = K [x; y; x y] + p0
+    (6)      [p; l] = K [x; y; x y] + p0,   to which (3) adds (1 + s) offset / |r|
 
 Pointing errors are on the right, in N: a constant error of the attitude reference stays constant there while the camera turns.
 Source: Li, Cui and Cui (2007), with their equation numbers.
@@ -58,7 +58,8 @@ class PositionVelocityPointing:
 
 @pytree
 class PositionPointingOffset:
-    """Relative position, pointing, and `s`, (1,), the relative error of the offset from centre of light to centre of figure."""
+    """Relative position, pointing, and `s`, (1,), the relative error of the offset from centre of figure to centre of light: a
+    radius or a law of reflection that is not what it was taken for."""
 
     r: Array
     q: Array
@@ -94,7 +95,8 @@ class Camera:
 
 @pytree
 class Sight:
-    """Context of a frame: R_CB (3, 3); offset (2,) px of one unit of `s`; cov (2, 2) px^2 added to the camera's."""
+    """Context of a frame: R_CB (3, 3); offset (2,) px m, from the centre of figure to the centre of light that is measured, times
+    the distance; cov (2, 2) px^2 added to the camera's."""
 
     R_CB: Array
     offset: Array
@@ -113,7 +115,7 @@ def _step(p: Motion, x: Any, u: Any, dt: Array, w: Array) -> Any:
     if hasattr(x, "q"):
         values["q"] = so3_right.boxplus(x.q, w[3:6])
     if hasattr(x, "s"):
-        values["s"] = x.s
+        values["s"] = x.s + w[6:]
     return type(x)(**values)
 
 
@@ -121,7 +123,10 @@ def _noise_cov(p: Motion, x: Any, u: Any, dt: Array) -> Array:
     position = jnp.full(3, p.sigma_r**2)
     if not hasattr(x, "q"):
         return jnp.diag(position)
-    return jnp.diag(jnp.concatenate([position, jnp.full(3, p.sigma_q**2 * dt)]))
+    variances = [position, jnp.full(3, p.sigma_q**2 * dt)]
+    if hasattr(x, "s"):
+        variances.append(jnp.reshape(u**2, (1,)))
+    return jnp.diag(jnp.concatenate(variances))
 
 
 def _noise_sample(p: Motion, x: Any, u: Any, dt: Array, key: Array) -> Array:
@@ -133,11 +138,13 @@ def _noise_sample(p: Motion, x: Any, u: Any, dt: Array, key: Array) -> Array:
     position = scale * (gamma - SHAPE)
     if not hasattr(x, "q"):
         return position
-    return jnp.concatenate([position, p.sigma_q * jnp.sqrt(dt) * jax.random.normal(second, (3,))])
+    normal = jax.random.normal(second, (4,))
+    parts = [position, p.sigma_q * jnp.sqrt(dt) * normal[:3]]
+    return jnp.concatenate([*parts, u * normal[3:]] if hasattr(x, "s") else parts)
 
 
 def _noise_logpdf(p: Motion, x: Any, u: Any, dt: Array, w: Array) -> Array:
-    """-inf below the Gamma's support."""
+    """-inf below the Gamma's support. Not for states with `s`, whose walk may be of zero width."""
     scale = p.sigma_r / jnp.sqrt(SHAPE)
     g = w[:3] / scale + SHAPE
     inside = jnp.all(g > 0.0)
@@ -156,14 +163,15 @@ def _jacobian_six(p: Motion, x: Any, u: Any, dt: Array) -> tuple[Array, None]:
 
 
 def pixel_line(p: Camera, x: Any, a: Sight) -> Array:
-    """(4)-(6): pixel and line (2,) of the body's centre (of its centre of light, moved by `s`)."""
+    """(3)-(6): pixel and line (2,) of the centre of light, `offset` over the distance away from the body's centre."""
     q = x.q if hasattr(x, "q") else p.q_BN
     u = a.R_CB @ quaternion.rotate(q, -x.r)
     # Behind the camera there is no image; a tiny depth keeps the numbers finite and the residual huge.
     depth = jnp.where(u[2] > 1e-9 * jnp.sqrt(jnp.sum(u * u)), u[2], 1e-9 * jnp.sqrt(jnp.sum(u * u)))
     t, s = u[0] / depth, u[1] / depth
     z = p.K @ jnp.stack([t, s, t * s]) + p.p0
-    return z + a.offset * x.s[0] if hasattr(x, "s") else z
+    share = 1.0 + x.s[0] if hasattr(x, "s") else 1.0
+    return z + share * a.offset / jnp.sqrt(jnp.sum(x.r * x.r))
 
 
 def _minus(z: Array, z_hat: Array) -> Array:
@@ -175,6 +183,7 @@ def _pixel_cov(p: Camera, x: Any, a: Sight) -> Array:
 
 
 _SIX = Noise(_noise_cov, 6, _noise_sample, _noise_logpdf)
+_SEVEN = Noise(_noise_cov, 7, _noise_sample)
 _THREE = Noise(_noise_cov, 3, _noise_sample, _noise_logpdf)
 
 
@@ -191,6 +200,6 @@ def relative_model(motion: Motion, camera: Camera, state: type = PositionPointin
         PositionVelocityPointing: position_velocity_pointing,
         PositionPointingOffset: position_pointing_offset,
     }[state]
-    noise = _THREE if state is PositionVelocity else _SIX
+    noise = {PositionVelocity: _THREE, PositionPointingOffset: _SEVEN}.get(state, _SIX)
     jacobian = _jacobian_six if state is PositionPointing else None
     return Model(retraction, Process(_step, noise, motion, jacobian), (body_camera(camera),))

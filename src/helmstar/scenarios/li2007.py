@@ -41,13 +41,14 @@ from ..models.relative import (
     Camera,
     Motion,
     PositionPointing,
+    PositionPointingOffset,
     PositionVelocity,
     PositionVelocityPointing,
     Sight,
     relative_model,
 )
 from .experiment import Call, Variable
-from .li2007_data import FILTER, Data, Setting, key_of, simulate
+from .li2007_data import FILTER, Data, Pictures, Setting, key_of, simulate, simulate_from_images
 from .li2007_specification import Specification
 
 Array = jax.Array
@@ -71,13 +72,13 @@ class Prior:
 
 
 def _start_state(state: type, prior: Prior, position: Array) -> Any:
-    values = {"r": position, "v": prior.velocity, "q": prior.q_ref}
+    values = {"r": position, "v": prior.velocity, "q": prior.q_ref, "s": jnp.zeros(1)}
     return state(**{name: values[name] for name in state.__dataclass_fields__})
 
 
 def _true_states(state: type, data: Data) -> Any:
     steps = data.r.shape[0]
-    values = {"r": data.r, "v": jnp.broadcast_to(data.v, (steps, 3)), "q": data.q}
+    values = {"r": data.r, "v": jnp.broadcast_to(data.v, (steps, 3)), "q": data.q, "s": jnp.zeros((steps, 1))}
     return state(**{name: values[name] for name in state.__dataclass_fields__})
 
 
@@ -110,20 +111,29 @@ def _moments(kind: str, retraction: Any, belief: Any) -> Gaussian:
     return particle_moments(retraction, belief) if kind == "literal" else mixture_moments(retraction, belief)
 
 
-@partial(jax.jit, static_argnames=("filter", "kind", "n", "state"))
+@partial(jax.jit, static_argnames=("filter", "kind", "n", "state", "corrected"))
 def estimate(
-    model: Model, prior: Prior, dt: Array, data: Data, *, filter: Any, kind: str, n: int, state: type
+    model: Model,
+    prior: Prior,
+    dt: Array,
+    data: Data,
+    *,
+    filter: Any,
+    kind: str,
+    n: int,
+    state: type,
+    corrected: bool = True,
 ) -> dict[str, Array]:
     """Track of one estimator over all runs of `data`. kind: what its belief is; n: particles or components, or for "batch"
-    iterations."""
+    iterations; corrected: whether the centre of light is known not to be the centre of figure."""
     r = model.retraction
     steps = data.z.shape[1]
 
     def one(data: Data) -> dict[str, Array]:
         mean = _start_state(state, prior, data.start)
-        sight = Sight(data.R_CB, data.offset, data.cov)
+        sight = Sight(data.R_CB, data.offset if corrected else jnp.zeros_like(data.offset), data.cov)
         m = (Measurement(data.z, sight, data.seen[:, None]),)
-        u, dts = jnp.zeros(steps), jnp.full(steps, dt)
+        u, dts = data.walk, jnp.full(steps, dt)
         if kind == "batch":
             found = map_estimates(model, Gaussian(mean, prior.P0), u, dts, m, n)
             nan = jnp.full(steps, jnp.nan)
@@ -138,14 +148,17 @@ def estimate(
 
             _, _, (found, nis, dof, status, effective) = run(filter, model, belief, u, dts, m, no_gate(8), keep=keep)
         truth = _true_states(state, data)
-        e = jax.vmap(r.boxminus)(truth, found.mean)
-        floor = jnp.diag(jnp.diagonal(prior.P0) * COLLAPSED**2)
-        white = jax.vmap(lambda P, e: small.matvec(small.invert_lower(small.cholesky(P + floor)), e))(found.cov, e)
-        sigma = jnp.sqrt(jnp.diagonal(found.cov, axis1=1, axis2=2))
+        # The offset's error has no true value where the law is not the one assumed: what is scored is what has one.
+        scored = r.dim - 1 if state is PositionPointingOffset else r.dim
+        e = jax.vmap(r.boxminus)(truth, found.mean)[:, :scored]
+        cov = found.cov[:, :scored, :scored]
+        floor = jnp.diag(jnp.diagonal(prior.P0)[:scored] * COLLAPSED**2)
+        white = jax.vmap(lambda P, e: small.matvec(small.invert_lower(small.cholesky(P + floor)), e))(cov, e)
+        sigma = jnp.sqrt(jnp.diagonal(cov, axis1=1, axis2=2))
         return {
             "position_error_km": e[:, :3] / KM,
             "position_sigma_km": sigma[:, :3] / KM,
-            "nees_per_state": jnp.sum(white**2, axis=1) / r.dim,
+            "nees_per_state": jnp.sum(white**2, axis=1) / scored,
             "nis": nis,
             "nis_dof": dof,
             "status": status,
@@ -182,7 +195,7 @@ class Experiment:
     variables = VARIABLES
     coordinates: ClassVar[dict[str, Any]] = {}
 
-    def __init__(self, spec: Specification, name: str = "li2007"):
+    def __init__(self, spec: Specification, name: str = "li2007", workers: int = 1):
         self.spec = spec
         self.name = name
         self.title = spec.title
@@ -220,7 +233,29 @@ class Experiment:
         arrays: dict[str, Any] = {k: np.asarray(v) for k, v in values.items()}
         setting = Setting(camera=self.camera, steps=spec.updates, gamma=t.noise == "gamma", **arrays)
         self.simulate = Call(simulate, (setting,))
+        self.from_images = spec.camera.level == "image"
+        if self.from_images:
+            self.simulate = Call(simulate_from_images, (setting, self._pictures(setting, workers)))
         self.estimators = self._estimators()
+
+    def _pictures(self, setting: Setting, workers: int) -> Pictures:
+        """What the frames of all runs show; the runs that pad the last block have theirs too."""
+        from scipy.spatial.transform import Rotation
+
+        from .li2007_frames import take_frames
+
+        runs = -(-self.spec.runs // self.width) * self.width
+        data = simulate(setting, jnp.arange(runs))
+        r, q, R_CB = (np.asarray(a) for a in (data.r, data.q, data.R_CB))
+        sun = np.asarray(self.spec.sun.direction)
+        true = np.einsum("...ij,...j->...i", R_CB, Rotation.from_quat(q.reshape(-1, 4)).apply(sun).reshape(r.shape))
+        known = R_CB @ Rotation.from_quat(self.q_ref).apply(sun)
+        lights = take_frames(self.spec, np.asarray(data.z), np.linalg.norm(r, axis=-1), true, known, workers)
+        change = np.abs(np.diff(lights.phase, axis=1, prepend=lights.phase[:, :1]))
+        # From frame to frame with nothing seen between there is no phase to compare with.
+        change = np.where(lights.seen & np.roll(lights.seen, 1, axis=1), change, 0.0)
+        values: Any = (lights.z, lights.cov, lights.offset, self.spec.body.offset_walk_rad * change, lights.seen)
+        return Pictures(*values)
 
     def _estimators(self) -> dict[str, Call]:
         t = self.spec.tuning
@@ -228,17 +263,22 @@ class Experiment:
         mean = self.mean_r if self.spec.truth.mean_known else 0.0
         motion = Motion(*_numbers(self.v, self.sigma_r, mean, self.sigma_q))
 
-        def call(kind: str, filter: Any, n: int, spread: Spread, state: type = PositionPointing) -> Call:
-            variances = {"r": self.P0[:3], "v": self.velocity_variance, "q": self.P0[3:]}
+        usual_state: type = PositionPointingOffset if self.from_images else PositionPointing
+
+        def call(
+            kind: str, filter: Any, n: int, spread: Spread, state: type = usual_state, corrected: bool = True
+        ) -> Call:
+            doubt = np.array([self.spec.body.offset_sigma**2])
+            variances = {"r": self.P0[:3], "v": self.velocity_variance, "q": self.P0[3:], "s": doubt}
             P0 = np.diag(np.concatenate([variances[name] for name in state.__dataclass_fields__]))
             direction = np.concatenate([along, np.zeros(len(P0) - 3)])
             values = _numbers(P0, self.q_ref, self.v, direction, self.spec.seed)
             prior = Prior(*values, spread=spread, kernel=_numbers(t.kernel)[0])
             model = relative_model(motion, self.camera, state)
-            static = {"filter": filter, "kind": kind, "n": n, "state": state}
+            static = {"filter": filter, "kind": kind, "n": n, "state": state, "corrected": corrected}
             return Call(estimate, (model, prior, _numbers(self.spec.step_s)[0]), static)
 
-        def ekf(state: type = PositionPointing) -> Any:
+        def ekf(state: type = usual_state) -> Any:
             return ErrorStateKalmanFilter(relative_model(motion, self.camera, state).retraction)
 
         r = ekf().retraction
@@ -246,7 +286,7 @@ class Experiment:
         narrow = UnscentedKalmanFilter(r, prediction="linear")
         points, kernels = t.particles, t.unscented_particles
         main = int(np.argmax(np.abs(self.v)))  # the axis that is nearest to the track: the one that is not linear
-        return {
+        out = {
             "ekf": call("gaussian", ekf(), 0, usual),
             "ukf": call("unscented", UnscentedKalmanFilter(r), 0, usual),
             "ukf_printed": call("unscented", UnscentedKalmanFilter(r), 0, printed),
@@ -262,6 +302,13 @@ class Experiment:
                 "gaussian", ekf(PositionVelocityPointing), 0, usual, PositionVelocityPointing
             ),
         }
+        if self.from_images:
+            plain = ekf(PositionPointing)
+            out["ekf_trusting"] = call("gaussian", plain, 0, usual, PositionPointing)
+            out["ekf_uncorrected"] = call("gaussian", plain, 0, usual, PositionPointing, corrected=False)
+            # The transition of the literal filter has a density that the offset's walk does not always have.
+            del out["upf_printed"]
+        return out
 
     @cached_property
     def bound(self) -> np.ndarray:

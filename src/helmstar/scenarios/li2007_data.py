@@ -42,8 +42,8 @@ class Setting:
 @pytree
 class Data:
     """Of one run. r, q (steps, ...), v (3,): truth; R_CB (steps, 3, 3): how the camera is turned, known; z (steps, 2) px and
-    whether the body is in the field, seen (steps,); start (3,): position that filters start from; offset, cov: of `Sight`;
-    light (steps, 2): the centre of light, uncorrected, px; run: number."""
+    whether the body is in the field, seen (steps,); start (3,): position that filters start from; offset, cov: of `Sight`; walk
+    (steps,): 1 sigma of the steps of the offset's relative error; run: number."""
 
     r: Array
     q: Array
@@ -54,7 +54,7 @@ class Data:
     start: Array
     offset: Array
     cov: Array
-    light: Array
+    walk: Array
     run: Array
 
 
@@ -98,10 +98,32 @@ def _simulate_run(s: Setting, run_id: Array) -> Data:
 
     _, (r, q, R_CB, z, seen) = jax.lax.scan(step, PositionPointing(s.r0, q0), jnp.arange(1, s.steps + 1))
     zero = jnp.zeros((s.steps, 2))
-    return Data(r, q, v, R_CB, z, seen, start, zero, jnp.zeros((s.steps, 2, 2)), z, run_id)
+    return Data(r, q, v, R_CB, z, seen, start, zero, jnp.zeros((s.steps, 2, 2)), jnp.zeros(s.steps), run_id)
 
 
 @jax.jit
 def simulate(setting: Setting, run_ids: Array) -> Data:
     """Data of the runs with these numbers."""
     return jax.vmap(partial(_simulate_run, setting))(run_ids)
+
+
+@pytree
+class Pictures:
+    """What frames show, of all runs: as `li2007_frames.Lights`, with `walk` from the change of phase."""
+
+    z: Array
+    cov: Array
+    offset: Array
+    walk: Array
+    seen: Array
+
+
+@jax.jit
+def simulate_from_images(setting: Setting, pictures: Pictures, run_ids: Array) -> Data:
+    """As `simulate`, with the centres of light that the frames show: truth and starts are the same to the bit."""
+
+    def one(run_id: Array) -> Data:
+        d, p = _simulate_run(setting, run_id), jax.tree.map(lambda a: a[run_id], pictures)
+        return Data(d.r, d.q, d.v, d.R_CB, p.z, p.seen, d.start, p.offset, p.cov, p.walk, run_id)
+
+    return jax.vmap(one)(run_ids)

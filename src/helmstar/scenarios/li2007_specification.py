@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -81,9 +82,11 @@ class Sun(_Table):
 
 class Body(_Table):
     radius_km: Annotated[float, Field(ge=1e-3, le=1e5)]
-    law: Literal["lambert", "lommel-seeliger"]
+    law: Literal["lambert", "lommel_seeliger", "mcewen", "minnaert", "hapke"]
     radius_error: Annotated[float, Field(gt=-0.9, le=10)]
-    assumed_law: Literal["lambert", "lommel-seeliger"]
+    assumed_law: Literal["lambert", "lommel_seeliger", "mcewen", "minnaert", "hapke"]
+    offset_sigma: Annotated[float, Field(ge=1e-4, le=10)]
+    offset_walk_rad: Annotated[float, Field(ge=0, le=10)]
 
 
 class TuningTable(_Table):
@@ -95,6 +98,10 @@ class TuningTable(_Table):
     ukf_beta: Annotated[float, Field(ge=0, le=100)]
     ukf_kappa: Annotated[float, Field(gt=-6, le=1000)]
     batch_iterations: Annotated[int, Field(ge=1, le=20)]
+
+
+OF_IMAGES = {"runs": 20}
+"""What stands for these keys at level "image" where nobody says otherwise: a frame takes some 10 ms."""
 
 
 class Specification(ScenarioSpecification):
@@ -111,6 +118,25 @@ class Specification(ScenarioSpecification):
     sun: Sun
     body: Body
     tuning: TuningTable
+
+    @classmethod
+    def adapted(cls, content: Mapping[str, Any], stated: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Fewer runs at level "image", unless they are stated."""
+        camera = content.get("camera")
+        if not (isinstance(camera, Mapping) and camera.get("level") == "image"):
+            return content
+        return {**content, **{k: v for k, v in OF_IMAGES.items() if k not in stated}}
+
+    @property
+    def note(self) -> str:
+        """What the user should know before it starts."""
+        if self.camera.level != "image":
+            return ""
+        blocks = -(-self.runs // self.width)
+        return (
+            f"camera.level = image: {blocks * self.width * self.updates} frames are rendered and measured first; unless stated "
+            f"there are {OF_IMAGES['runs']} runs (--runs)"
+        )
 
     @model_validator(mode="after")
     def _does_not_hit(self) -> Specification:

@@ -160,11 +160,15 @@ def specification_of(experiment: str) -> type[ScenarioSpecification]:
         from .li2007_specification import Specification
 
         return Specification
+    if experiment == "approach":
+        from .approach_specification import Specification
+
+        return Specification
     raise ConfigurationError(f"experiment {experiment!r}: must be one of {', '.join(library())}")
 
 
 def build(name: str, specification: Any, workers: int = 1) -> Any:
-    """The experiment of a specification, ready to run (this loads JAX); workers: processes where it takes star images."""
+    """The experiment of a specification, ready to run (this loads JAX); workers: processes where it takes frames."""
     if specification.experiment == "xu2020":
         from .xu2020 import Experiment
 
@@ -175,6 +179,10 @@ def build(name: str, specification: Any, workers: int = 1) -> Any:
         return Experiment(specification, name)
     if specification.experiment == "li2007":
         from .li2007 import Experiment
+
+        return Experiment(specification, name, workers)
+    if specification.experiment == "approach":
+        from .approach import Experiment
 
         return Experiment(specification, name)
     raise ConfigurationError(f"experiment {specification.experiment!r}: must be one of {', '.join(library())}")
