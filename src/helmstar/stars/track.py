@@ -67,11 +67,13 @@ def track(
         level = levels_for(d, freedom, LADDER)[0][0]
         volume = min(SO3_VOLUME, (np.sqrt(2.0 * np.pi) * 2.0 * prior_sigma) ** 3)
         R = matrix_of_quaternion(q)
-        fit = verify(sky, level, d, R, camera.focal_px, freedom, first_gate=window, rounds=2, volume=volume)
-        if fit is not None:
-            found = conclude(sky, d, covariances, freedom, [fit], 0, FEWEST, limit, q_SB)
-            if found.solved:
-                return found
+        # One step is enough for most; a second one is there for windows in which many false matches pull.
+        for rounds in (1, 2):
+            fit = verify(sky, level, d, R, camera.focal_px, freedom, first_gate=window, rounds=rounds, volume=volume)
+            if fit is not None:
+                found = conclude(sky, d, covariances, freedom, [fit], 0, FEWEST, limit, q_SB)
+                if found.solved:
+                    return found
     if not fall_back:
         return unsolved("no match", 0)
     return identify(

@@ -324,7 +324,7 @@ class _Field:
             p, _ = project(self.r, R, f)
             seen = np.flatnonzero(inside(p, d.low, d.high) & (d.faintest >= self.V))[: self.limit]
             p = p[seen]
-            widen = (first_gate, 0.5 * (1.0 + first_gate), 1.0)[min(turn_number, 2)]
+            widen = 1.0 if turn_number == rounds else (first_gate, 0.5 * (1.0 + first_gate), 1.0)[min(turn_number, 2)]
             excess = None
             if d.magnitude is not None and zero is not None and turn_number > 0:
                 z = (self.V[seen][:, None] - d.magnitude[None, :] - zero) / d.magnitude_sigma
@@ -359,7 +359,8 @@ class _Field:
             soft = sigma * np.sqrt(1.0 + square / (2.0 * widen) ** 2)
             delta, _ = step(p[i] / f, residual, soft, f, freedom)
             R = turn(delta[:3], R)
-            f = float(np.clip(f * np.exp(np.clip(delta[3], -0.1, 0.1)), 0.97 * freedom.f_low, 1.03 * freedom.f_high))
+            f = f * math.exp(min(max(float(delta[3]), -0.1), 0.1))
+            f = min(max(f, 0.97 * freedom.f_low), 1.03 * freedom.f_high)
         return None
 
 
