@@ -14,8 +14,12 @@ from scipy.stats import chi2
 
 from helmstar.cli import main
 from helmstar.errors import ConfigurationError, DataError
+from helmstar.io.clock import Origin
+from helmstar.io.telemetry import AttitudeRows, GyroRows, Telemetry, read_telemetry
+from helmstar.sensors.configuration import SensorsConfiguration
 from helmstar.startracker.command import SolveOptions
 from helmstar.startracker.frames import find_frames, solve_frames
+from helmstar.telemetry.solve import solve
 
 OPTICS = SolveOptions(fov="14")
 MOUNTING = [0.1, -0.2, 0.3, 0.9273618495495703]
@@ -220,11 +224,39 @@ def test_misuse_of_the_command_is_explained(capsys, tmp_path, night):
         assert word in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_attitudes_without_noise_and_gyro_are_refused(tmp_path):
-    from helmstar.io.telemetry import read_telemetry
-    from helmstar.sensors.configuration import SensorsConfiguration
-    from helmstar.telemetry.solve import solve
+def test_attitudes_alone_are_honest_about_attitude_and_rate():
+    """A rate that walks at random by 0.003 deg/s/sqrt(s), 5 arcsec attitudes each second, a gap of 20 s: the walk is found within a
+    third; NEES of attitude and of the mean rate since the attitude before lie within what 60 independent triples give, of 240
+    that are correlated over some 4 s."""
+    rng = np.random.default_rng(2)
+    n, sub, walk, sigma = 260, 20, np.radians(0.003), np.radians(5.0 / 3600.0)
+    rate = walk * np.cumsum(rng.standard_normal((n * sub, 3)), axis=0) / np.sqrt(sub)
+    q = [Rotation.random(rng=rng)]
+    for w in rate[:-1]:
+        q.append(Rotation.from_rotvec(-w / sub) * q[-1])
+    keep = np.ones(n, dtype=bool)
+    keep[120:140] = False
+    truth, time = Rotation.concatenate(q)[::sub][keep], np.arange(n, dtype=float)[keep]
+    measured = Rotation.from_rotvec(sigma * rng.standard_normal((len(time), 3))) * truth
+    none, count = np.empty(0, dtype=int), np.arange(len(time))
+    covariance = np.broadcast_to(sigma**2 * np.eye(3), (len(time), 3, 3)).copy()
+    rows = AttitudeRows(time, 0 * count, count, ("x",), measured.as_quat(), covariance)
+    gyro = GyroRows(np.empty(0), none, none)
+    solution = solve(Telemetry(gyro, rows, None, (), "s", Origin(0, 0.0, False)), SensorsConfiguration())
+    assert solution.rate_sigma == pytest.approx(walk, rel=0.33)
+    mean_rate = -(truth[1:] * truth[:-1].inv()).as_rotvec() / np.diff(time)[:, None]
+    low, high = chi2.ppf([5e-4, 1 - 5e-4], 180) / 60.0
+    for e in (solution.filtered, solution.smoothed):
+        error = (truth * Rotation.from_quat(e.q_BN).inv()).as_rotvec()
+        squares = np.einsum("ni,nij,nj->n", error, np.linalg.inv(e.cov[:, :3, :3]), error)
+        assert low < squares.mean() < high
+        assert e.rate is not None
+        assert e.rate_sigma is not None
+        assert 0.5 * low < (((e.rate[1:] - mean_rate) / e.rate_sigma[1:]) ** 2).sum(axis=1).mean() < high
+        assert np.sqrt(np.mean(error**2)) < sigma  # better than the measurements
 
+
+def test_attitudes_without_noise_and_gyro_are_refused(tmp_path):
     table = tmp_path / "q.csv"
     table.write_text("time_s,q_bn_x,q_bn_y,q_bn_z,q_bn_w\n" + "".join(f"{k},0,0,0,1\n" for k in range(5)))
     telemetry = read_telemetry([table], needs=("star",))
