@@ -144,7 +144,7 @@ def test_a_wrong_file_is_explained(tmp_path, content, words):
 
 
 def test_an_unknown_scenario_lists_those_there_are():
-    with pytest.raises(ConfigurationError, match="there are xu2020"):
+    with pytest.raises(ConfigurationError, match=f"there are {', '.join(library())}"):
         load("xu2021")
 
 

@@ -12,28 +12,22 @@ that the numbers do not depend on how the work is shared out.
 
 from __future__ import annotations
 
-import hashlib
 import json
-import multiprocessing
-import signal
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from pathlib import Path
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from ..errors import DataError
-from ..files import replacing
 from ..imaging import Camera, DetectionSettings
 from ..progress import Progress
+from .kept import kept, side_by_side
 from .xu2020_specification import StarImage
 
 BLOCK = 40
-HELP_PAYS = 300
-"""Fewer frames than this are solved in this process: another one takes two seconds to start."""
+SOURCES = ("imaging", "stars", "sensors", "attitude", "scenarios")
+"""Rooms whose code the frames depend on."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +71,9 @@ def take_frames(
     workers: processes (more than one needs a script with the usual guard of `__main__`). Raises DataError where a run's first frame
     shows nothing, from which no filter can start.
     """
-    path = _kept_at(image, seed, runs, step_s, q, r_N)
-    frames = _read(path)
-    if frames is None:
-        frames = _take(image, seed, runs, step_s, q, r_N, workers)
-        _keep(path, frames)
+    facts = [image.model_dump(), seed, runs, step_s, BLOCK]
+    made = kept(facts, (q, r_N), SOURCES, lambda: vars(_take(image, seed, runs, step_s, q, r_N, workers)))
+    frames = Frames(**made)
     lost = np.argwhere(~frames.seen[:, 0])
     if len(lost):
         run, head = lost[0]
@@ -121,24 +113,12 @@ def _take(
     count = 2 * runs * steps
     with Progress(True) as bar:
         job = bar.add(f"{count} frames", len(tasks))
-        if workers > 1 and count > HELP_PAYS:
-            results = _in_processes(tasks, workers)
-        else:
-            results = map(solve_block, tasks)
+        results = side_by_side(solve_block, tasks, workers, count)
         for task, (a, b, c) in zip(tasks, results, strict=True):
             part = (task.run, slice(task.first, task.first + len(a)), task.head)
             z[part], cov[part], seen[part] = a, b, c
             bar.advance(job)
     return Frames(z, cov, seen)
-
-
-def _in_processes(tasks: Iterable[_Task], workers: int) -> Iterator[tuple[np.ndarray, ...]]:
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_leave_interrupts) as pool:
-        yield from pool.map(solve_block, tasks)
-
-
-def _leave_interrupts() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def solve_block(task: _Task) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -225,51 +205,6 @@ def _looking_along(b: np.ndarray) -> np.ndarray:
     x = np.cross(b, np.eye(3)[int(np.argmin(np.abs(b)))])
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(b, x), b])
-
-
-def _kept_at(image: StarImage, seed: int, runs: int, step_s: float, *arrays: np.ndarray) -> Path | None:
-    """Where these frames are kept; None where the cache is switched off."""
-    from ..stars.patterns import cache_folder
-
-    folder = cache_folder()
-    if folder is None:
-        return None
-    digest = hashlib.sha256(json.dumps([image.model_dump(), seed, runs, step_s, BLOCK, _sources()]).encode())
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return folder.parent / "frames" / f"{digest.hexdigest()[:32]}.npz"
-
-
-@cache
-def _sources() -> str:
-    """Of all that makes frames and solves them: other sources give other numbers."""
-    root = Path(__file__).parent.parent
-    files = [f for room in ("imaging", "stars", "sensors", "attitude") for f in sorted((root / room).rglob("*.py"))]
-    digest = hashlib.sha256(np.__version__.encode())
-    for f in (*files, Path(__file__)):
-        digest.update(f.read_bytes())
-    return digest.hexdigest()
-
-
-def _read(path: Path | None) -> Frames | None:
-    try:
-        if path is not None and path.exists():
-            with np.load(path, allow_pickle=False) as f:
-                return Frames(f["z"], f["cov"], f["seen"])
-    except Exception:  # a damaged file: taken again
-        pass
-    return None
-
-
-def _keep(path: Path | None, frames: Frames) -> None:
-    if path is None:
-        return
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as part, open(part, "wb") as stream:
-            np.savez(stream, z=frames.z, cov=frames.cov, seen=frames.seen)
-    except OSError:  # a full or read-only home only means that they are taken again
-        pass
 
 
 __all__ = ["Frames", "take_frames"]
