@@ -241,8 +241,9 @@ Exit code: 0 all images were used, 2 some were not, 1 misuse or too few stars.""
         "opnav",
         help="centres of a target body in frames, and the probe's trajectory relative to it",
         description="""Find the centre of figure of a body in frames (FITS or images) with its covariance, and the probe's
-trajectory relative to the body. Times are those of FITS headers, or of a table with the columns file and time_utc or time_s among the
-frames. The attitude is a table as `helmstar attitude` writes it. Exit code: 0 all centres found, 2 some not, 1 misuse.""",
+trajectory relative to the body. Times are those of FITS headers, or of a table with the columns file and time_utc or time_s
+among the frames. The attitude is a table as `helmstar attitude` writes it.
+Exit code: 0 all centres found, 2 some not, 1 misuse.""",
         epilog="""examples:
   helmstar opnav frames/*.fits --camera cam.toml --attitude attitude.parquet --body body.toml
   helmstar opnav frames.csv --camera cam.toml --attitude attitude.parquet --body body.toml --json --out nav""",

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.fft import irfft2, next_fast_len, rfft2
-from scipy.ndimage import correlate1d
+from scipy.ndimage import correlate1d, uniform_filter
 
 from ..camera import Camera
 from ..frame import Image
@@ -43,6 +43,8 @@ COARSE_PX = 24.0
 """Diameter to which a large body is binned for the first fit."""
 FLOOR_PX, LAW_FLOOR_PX, LAW_FLOOR = 0.002, 0.006, 3e-5
 """1 sigma of what templates leave: of rendering, px, and of laws that the family comes near, px and per px of diameter."""
+HOPELESS = 10.0
+"""Squares per degree of freedom from which a fit that does not settle is none."""
 STILL = 0.02
 """A step that lowers the sum of squares by less, in units of the noise, is the last."""
 LAW_FREEDOM = 0.5
@@ -92,8 +94,10 @@ class _Problem:
         self.ok = good.ravel().astype(float)
         self.y = np.where(good, grey, 0.0).ravel().astype(float)
         self.noise = data.noise
-        self.w = self.ok / data.noise**2
         self.shot = 1.0 / detector.gain_e if detector.gain_e else 0.0
+        # Weights by light that is itself noisy pull down; of 3 x 3 pixels and once only, by less than noise leaves.
+        light = np.maximum(uniform_filter(np.asarray(grey, float), 3), 0.0).ravel()
+        self.w = self.ok / (data.noise**2 + self.shot * light)
         spread = [self.sigma_size, 2.0 * detector.psf_spread, *[max(target.shape_sigma, 1e-6)] * self.free]
         self.prior = np.concatenate([[0.0, 0.0], 1.0 / np.square(spread)])
         stretches = [] if not self.free else [0.0] * 5 if start.stretch is None else list(_components(start.stretch))
@@ -178,17 +182,20 @@ class _State:
 
 def fit(
     data: Data, scene: Scene, start: Trial, detector: Detector, *, iterations: int = 50, freedom: float = LAW_FREEDOM,
-    margin_px: float = 2.0,
+    margin_px: float = 2.0, still_px: float = 1e-3,
 ) -> Fit:  # fmt: skip
     """Levenberg and Marquardt's least squares from a start, which should lie within about half of the body's radius.
 
     freedom: prior sigma of the family's patterns. margin_px: by how much the window is wider than the body at the start.
+    still_px: a shorter step is the last.
     """
     problem = _Problem(data, scene, start, detector, freedom, margin_px)
     state = problem.solve(problem.start)
-    problem.weigh(state)
-    state = problem.solve(problem.start)
-    damping, converged, fresh, weighed = 1e-3, False, True, False
+    weighed = detector.gain_e is not None
+    if not weighed:
+        problem.weigh(state)
+        state = problem.solve(problem.start)
+    damping, converged, fresh = 1e-3, False, True
     A, J, g = np.eye(1), np.zeros((1, 1)), np.zeros(1)
     diameter = scene.diameter_px()
     most = np.array([0.25 * diameter + 0.5] * 2 + [0.2, 0.5] + [0.1] * problem.free)
@@ -215,7 +222,8 @@ def fit(
         else:
             damping = max(10.0 * damping, 1e-2)
         # What a step of Newton's length would gain is below what noise leaves, or steps that small gain nothing.
-        if abs(less) < STILL or damping > 1e3:
+        still = float(np.hypot(*move[:2])) < still_px and abs(float(move[2])) < 0.02 * problem.sigma_size + 1e-5
+        if abs(less) < STILL or still or damping > 1e3:
             if weighed:
                 converged = damping <= 1e3 or float(g @ np.linalg.solve(A, g)) < 9.0 * unit
                 break
@@ -262,7 +270,16 @@ def _positive(M: np.ndarray) -> np.ndarray:
 def coarse_fit(data: Data, scene: Scene, start: Trial, detector: Detector) -> Fit:
     """A fit of a binned frame: patterns stay near the law, and how noisy light is comes from the residuals."""
     size = 0.5 * scene.diameter_px() * min(3.0 * scene.pose.scale_sigma(scene.target), 0.6)
-    return fit(data, scene, start, replace(detector, gain_e=None), freedom=0.2, margin_px=3.0 + size, iterations=15)
+    return fit(
+        data,
+        scene,
+        start,
+        replace(detector, gain_e=None),
+        freedom=0.2,
+        margin_px=3.0 + size,
+        iterations=15,
+        still_px=0.01,
+    )
 
 
 def place(data: Data, scene: Scene, around: np.ndarray | None, reach_px: float) -> tuple[np.ndarray, float] | None:
@@ -318,13 +335,15 @@ def centre_from_fit(
         return nothing(centroid.status, "fit", centroid.message, diameter)
     g = preprocess(image)
     data = data_of(image, g.grey, g.noise, corner)
-    offset, _ = offsets(camera, target, pose, centroid.xy_px)
+    offset, unsure = offsets(camera, target, pose, centroid.xy_px)
     if not np.isfinite(offset).all():
         return nothing(
             DARK, "fit", "the side that faces the camera is not lit: is the Sun's direction right?", diameter
         )
     start = Trial(centroid.xy_px - offset)
     n = max(1, round(diameter / COARSE_PX))
+    if centroid.status == FOUND and float(np.trace(unsure)) < 1.0:
+        n = 1  # the moment is a start good enough
     if n > 1 or centroid.status in (CUT, SATURATED):
         coarse, small = data.binned(n), scene.binned(n)
         to = lambda xy: (xy - (n - 1) / 2) / n  # noqa: E731
@@ -337,7 +356,7 @@ def centre_from_fit(
             there = coarse_fit(coarse, small, there, detector).trial
         start = Trial(there.centre_px * n + (n - 1) / 2, there.size, there.stretch)
     # Templates on large pixels are right within a few hundredths of these; a body that was not binned may be of any size.
-    margin = 2.0 + (0.03 * diameter if n > 1 else 0.5 * diameter * min(2.0 * pose.scale_sigma(target), 0.5))
+    margin = 2.0 + (0.03 * diameter if n > 1 else min(diameter * pose.scale_sigma(target), 0.25 * diameter))
     result = fit(data, scene, start, detector, margin_px=margin)
     xy, C = result.trial.centre_px, result.covariance[:2, :2]
     C = C + np.eye(2) * (FLOOR_PX**2 + (0.0 if target.law_known else LAW_FLOOR_PX**2 + (LAW_FLOOR * diameter) ** 2))
@@ -349,8 +368,13 @@ def centre_from_fit(
     if result.snr < 8.0:
         return nothing(DARK, "fit", f"its light is only {result.snr:.1f} times the noise", diameter)
     if not result.converged:
-        status, message = (FAILED, "the template's fit did not settle") if status == FOUND else (status, message)
+        if result.chi2 > HOPELESS:
+            return nothing(
+                FAILED, "fit", "no template fits: are law, figure, distance and the Sun's direction right?", diameter
+            )
+        # It crept along a valley of its parameters: the place is that of a template that fits, not yet of the best.
         C = C + np.eye(2) * (0.02 * diameter) ** 2
+        message = message or "the fit did not settle; its covariance is enlarged"
     return FigureCentre(
         status, "fit", xy, C, centroid.xy_px, diameter, result.trial.size,
         math.sqrt(max(result.covariance[2, 2], 0.0)) * result.trial.size, chi2=result.chi2, message=message,
