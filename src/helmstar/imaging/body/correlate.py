@@ -43,8 +43,8 @@ COARSE_PX = 24.0
 """Diameter to which a large body is binned for the first fit."""
 FLOOR_PX, LAW_FLOOR_PX, LAW_FLOOR = 0.002, 0.006, 3e-5
 """1 sigma of what templates leave: of rendering, px, and of laws that the family comes near, px and per px of diameter."""
-HOPELESS = 10.0
-"""Squares per degree of freedom from which a fit that does not settle is none."""
+HOPELESS, EXPLAINED = 10.0, 0.8
+"""Squares per degree of freedom from which a fit that does not settle, or that explains less of the light's squares, is none."""
 STILL = 0.02
 """A step that lowers the sum of squares by less, in units of the noise, is the last."""
 LAW_FREEDOM = 0.5
@@ -62,7 +62,8 @@ _MORE = 3  # pixels around the window that they need
 class Fit:
     """trial: the best place, size and stretch. covariance: (p, p) of (x, y, log size, log psf variance, stretches..) in px of the
     data. chi2: weighted squares per degree of freedom. amounts: of the patterns. snr: of the whole. shot: variance per count.
-    psf_scale: of the optics' variance."""
+    psf_scale: of the optics' variance. explained: share
+    of the light's squares."""
 
     trial: Trial
     covariance: np.ndarray
@@ -72,6 +73,7 @@ class Fit:
     converged: bool
     shot: float
     psf_scale: float
+    explained: float
 
 
 class _Problem:
@@ -244,7 +246,8 @@ def _outcome(problem: _Problem, s: _State, J: np.ndarray, converged: bool) -> Fi
     C = (C * max(1.0, chi2) + _positive(more - C))[:q, :q]
     light = s.D[:, :-1] @ s.found[:-1]
     snr = float(light @ (problem.w * (s.rest + light))) / math.sqrt(max(float(problem.w @ light**2), 1e-300))
-    return Fit(problem.trial(s.p), C, chi2, s.found[:-1], snr, converged, problem.shot, math.exp(s.p[3]))
+    explained = 1.0 - float(problem.w @ s.rest**2) / max(float(problem.w @ problem.y**2), 1e-300)
+    return Fit(problem.trial(s.p), C, chi2, s.found[:-1], snr, converged, problem.shot, math.exp(s.p[3]), explained)
 
 
 def _components(S: np.ndarray) -> np.ndarray:
