@@ -26,7 +26,7 @@ def find_centre(
     """Centre of figure with covariance, or why there is none.
 
     corner: the frame's pixel that the image's (0, 0) is. method: one of METHODS; auto is by apparent diameter, the fit below
-    LIMB_ABOVE_PX, and falls back where a method does not settle: limb to fit, fit to moment. Raises ValueError for another method.
+    LIMB_ABOVE_PX, and a fit where a limb fails. Raises ValueError for another method.
     """
     if method not in METHODS:
         raise ValueError(f"method {method!r}: must be one of {', '.join(METHODS)}")
@@ -43,14 +43,10 @@ def find_centre(
         return centre_of_centroid(centroid, camera, target, pose)
     find = centre_from_limb if first == "limb" else centre_from_fit
     found = find(image, camera, target, pose, detector, corner=corner, centroid=centroid)
-    if method != "auto" or found.usable or centroid.status != FOUND:
-        return _checked(found, diameter)
-    if first == "limb":
+    if method == "auto" and first == "limb" and not found.usable:
         found = centre_from_fit(image, camera, target, pose, detector, corner=corner, centroid=centroid)
-        if found.usable:
-            return _checked(found, diameter)
-    moment = centre_of_centroid(centroid, camera, target, pose)
-    return replace(moment, message=f"by moment, because {found.method}: {found.message}")
+    # Not a moment in place of a fit: what no template fits is not what the moment's model takes it for.
+    return _checked(found, diameter)
 
 
 def _checked(found: FigureCentre, diameter_px: float) -> FigureCentre:

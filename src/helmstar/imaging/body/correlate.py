@@ -370,11 +370,12 @@ def centre_from_fit(
         return nothing(FAILED, "fit", "the template's fit ran away", diameter)
     if result.snr < 8.0:
         return nothing(DARK, "fit", f"its light is only {result.snr:.1f} times the noise", diameter)
+    lost = math.sqrt(max(float(np.trace(C)), 0.0)) > 0.5 * diameter + 2.0
+    poor = result.chi2 > HOPELESS and (not result.converged or result.explained < EXPLAINED)
+    if lost or poor:
+        text = "no template fits: are law, figure, distance and the Sun's direction right?"
+        return nothing(FAILED, "fit", text, diameter)
     if not result.converged:
-        if result.chi2 > HOPELESS:
-            return nothing(
-                FAILED, "fit", "no template fits: are law, figure, distance and the Sun's direction right?", diameter
-            )
         # It crept along a valley of its parameters: the place is that of a template that fits, not yet of the best.
         C = C + np.eye(2) * (0.02 * diameter) ** 2
         message = message or "the fit did not settle; its covariance is enlarged"
