@@ -23,8 +23,9 @@ is that kernel's prediction: proposal and transition match. The weight with the 
 
     w_i *= p(z | x) N(x; m_i', P_i') / N(x; m_i, P_i),
 
-is N(z; z_i, S_i) whatever x is where the measurement is linear within the kernel (`importance`); its mean over x is the evidence
-in any case. Kernels are narrow only along the directions in which the problem is not linear: what is linear stays marginalised.
+(the mean over two opposite draws) is N(z; z_i, S_i) whatever x is where the measurement is linear within the kernel
+(`importance`); its mean over x is the evidence in any case. Kernels are narrow only along the directions in which the problem is
+not linear: what is linear stays marginalised.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from ..core import Gate, Gaussian, Info, Measurement, Mixture, Process, Sensor, 
 from ..geometry import small
 from ..geometry.retraction import Retraction
 from .ekf import carry_covariance
-from .particle import judged, log_likelihood, log_normal, mean_of, root_of, spread_of
+from .particle import judged, log_likelihood, mean_of, root_of, spread_of
 from .resampling import Scheme, draw, effective_number, normalised, take
 
 Array = jax.Array
@@ -186,16 +187,25 @@ class MixtureFilter:
         return Mixture(components, log_weights, rest, effective), info
 
     def _true_weight(self, before: Any, after: Any, sensor: Sensor, m: Measurement, key: Array) -> Array:
-        """log p(z | x) + log N(x; before) - log N(x; after) at x drawn from `after`."""
+        """Log mean of p(z | x) N(x; before) / N(x; after) over two x drawn from `after`, opposite to each other: what is odd in
+        the sensor's curvature drops out of it, and the mean over draws is the evidence all the same."""
         r = self.retraction
-        root = small.cholesky(after.cov)
+        root, wide = small.cholesky(after.cov), small.cholesky(before.cov)
         normal = jax.random.normal(key, (r.dim,))
-        x = r.boxplus(after.mean, small.matvec(root, normal))
-        wide = small.cholesky(before.cov)
-        white = small.solve_lower(wide, r.boxminus(x, before.mean)[:, None])[:, 0]
-        prior = log_normal(white, jnp.sum(jnp.log(jnp.diagonal(wide))), r.dim)
-        proposal = log_normal(normal, jnp.sum(jnp.log(jnp.diagonal(root))), r.dim)
-        return log_likelihood(sensor, x, m)[0] + prior - proposal
+        log_det = jnp.sum(jnp.log(jnp.diagonal(root))) - jnp.sum(jnp.log(jnp.diagonal(wide)))
+
+        def weight(normal: Array) -> Array:
+            x = r.boxplus(after.mean, small.matvec(root, normal))
+            white = small.solve_lower(wide, r.boxminus(x, before.mean)[:, None])[:, 0]
+            return (
+                log_likelihood(sensor, x, m)[0]
+                - 0.5 * jnp.sum(white * white)
+                + 0.5 * jnp.sum(normal * normal)
+                + log_det
+            )
+
+        both = jax.vmap(weight)(jnp.stack([normal, -normal]))
+        return jax.scipy.special.logsumexp(both) - jnp.log(2.0)
 
     def _drawn(self, components: Any, states: tuple[int, ...], share: Array | float, key: Array, n: int) -> Any:
         """Components whose `states` have given `share` of their variance to a draw of their means."""
