@@ -13,6 +13,7 @@ import numpy as np
 
 PER_TILE = 12
 """Samples along the side of a tile."""
+_TAIL = 24  # samples of a tile that may count among the rarest
 _QUANTILES = ((0.8413, 1.0), (0.9332, 1.5))  # of a normal distribution, and how many sigma they lie above the median
 
 
@@ -24,10 +25,15 @@ class Mesh:
     noise: np.ndarray
     shape: tuple[int, int]
 
-    def limit(self, sigmas: float, every: int) -> np.ndarray:
-        """Sky plus so many sigma, for each block of `every` rows, the last one perhaps shorter: (blocks, width)."""
-        middles = np.arange(0, self.shape[0], every) + (every - 1) / 2
-        return between(self.sky + np.float32(sigmas) * self.noise, self.shape, middles, np.arange(self.shape[1]))
+    def least(self, sigmas: float) -> tuple[np.ndarray, np.ndarray]:
+        """Lower bounds (bands, width) of sky plus so many sigma in bands of rows, and where these begin and end (bands + 1,)."""
+        height, width = self.shape
+        lines = between_columns(self.sky + np.float32(sigmas) * self.noise, width, np.arange(width))
+        # Between the middles of two rows of tiles nothing lies below both of them.
+        n = len(lines)
+        rows = np.ceil((np.arange(n) + 0.5) * (height / n) - 0.5).astype(int)
+        lower = np.concatenate([lines[:1], np.minimum(lines[1:], lines[:-1]), lines[-1:]])
+        return lower, np.concatenate([[0], rows, [height]])
 
     def at(self, y: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Sky and noise (n,) at rows and columns (n,)."""
@@ -52,14 +58,17 @@ def between(mesh: np.ndarray, shape: tuple[int, int], y: np.ndarray, x: np.ndarr
 
     Not by matrix products, whose threads cost more than the work when a processor is shared.
     """
-    for at, size in ((x, shape[1]), (y, shape[0])):
-        m = np.ascontiguousarray(mesh.T)  # so that the axis to interpolate leads: columns, then rows
-        tile, part = _place(at, size, len(m))
-        m = np.concatenate([m, m[-1:]])
-        mesh = np.diff(m, axis=0)[tile]
-        mesh *= part[:, None]
-        mesh += m[tile]
-    return mesh
+    return between_columns(between_columns(mesh.T, shape[0], y).T, shape[1], x)
+
+
+def between_columns(mesh: np.ndarray, width: int, x: np.ndarray) -> np.ndarray:
+    """Rows of a mesh interpolated linearly at columns x of an image of that width: (rows, columns), float32."""
+    tile, part = _place(x, width, mesh.shape[1])
+    steps = np.diff(mesh, axis=1, append=mesh[:, -1:])
+    out = steps.take(tile, axis=1)
+    out *= part
+    out += mesh.take(tile, axis=1)
+    return out
 
 
 def mesh_of(sample: np.ndarray, shape: tuple[int, int], tile: int, floor: float) -> Mesh:
@@ -71,7 +80,7 @@ def mesh_of(sample: np.ndarray, shape: tuple[int, int], tile: int, floor: float)
     picks = []
     for n, s in zip(tiles, sample.shape):
         picks.append(np.minimum((np.arange(n * PER_TILE) + 0.5) * (s / (n * PER_TILE)), s - 1).astype(int))
-    values = sample[picks[0]][:, picks[1]].astype(np.float32)
+    values = sample.take(picks[0], axis=0).take(picks[1], axis=1).astype(np.float32)
     count = PER_TILE**2
     sky = _over_neighbours(np.sort(_by_tile(values, tiles), axis=-1)[..., count // 2])
     at = [(p + 0.5) * (size / s) - 0.5 for p, size, s in zip(picks, shape, sample.shape)]
@@ -80,8 +89,10 @@ def mesh_of(sample: np.ndarray, shape: tuple[int, int], tile: int, floor: float)
     middle = rest[..., count // 2]
     spread = [(rest[..., int(q * count)] - middle) / k for q, k in _QUANTILES]
     # Where sky and noise round to zero, one count in a thousand pixels is rare and tells: the spread cannot see that.
-    tail = rest.ravel()
-    rare = np.partition(tail, int(0.999 * tail.size))[int(0.999 * tail.size)] / 3.09
+    # A tile has its largest few in it; no tile decides alone.
+    above = rest.size - int(0.999 * rest.size)
+    tail = rest[..., -_TAIL:].ravel()
+    rare = np.partition(tail, tail.size - above)[tail.size - above] / 3.09
     noise = np.maximum(_over_neighbours(np.maximum(*spread)), np.clip(rare, 0.35 * floor, floor))
     return Mesh(sky=sky, noise=noise.astype(np.float32), shape=shape)
 
@@ -101,4 +112,4 @@ def _over_neighbours(mesh: np.ndarray) -> np.ndarray:
     return nine[4]
 
 
-__all__ = ["PER_TILE", "Mesh", "between", "mesh_of"]
+__all__ = ["PER_TILE", "Mesh", "between", "between_columns", "mesh_of"]

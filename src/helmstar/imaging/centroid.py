@@ -21,15 +21,21 @@ MIN_SIGMA = 0.3
 _LOOSE = 0.35  # relative spread of widths that the first guess allows
 _ERF = (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429)
 _PARAMETERS = 5.5  # of six, what the prior on sky and widths leaves free
-_STILL = 4e-3  # px; smaller steps change nothing that noise leaves
+_STILL = 0.02  # px; what is left after so small a step is its square
+_ALONG_Y, _ALONG_X = (
+    np.array([0, 1, 0, 2, 0, 3]),
+    np.array([0, 1, 2, 0, 3, 0]),
+)  # rows of the factors for each parameter
+_BY_Y, _BY_X = ((4 * k[:, None] + k).ravel() for k in (_ALONG_Y, _ALONG_X))
+_BY_BOTH = 4 * _ALONG_Y + _ALONG_X
 
 
 @dataclass(frozen=True)
 class Fit:
     """x, y: (n,) centre relative to the window's middle pixel. flux, sky: (n,). sigma: (n, 2) width along x and y, px.
 
-    bread: (n, 6, 6) inverse of J^T J; light: (n, 6, 6) J^T diag(model above the sky) J. Parameters: flux, sky, x, y, sigma_x,
-    sigma_y. residual: (n, m, m) window minus model, 0 where filled. model: (n, m, m) without the sky.
+    bread: (n, 6, 6) inverse of J^T J; light: (n, 6, 6) J^T diag(share of the light) J. J is over the flux, for flux over flux, sky
+    over flux, x, y, sigma_x, sigma_y. residual: (n, m, m) window minus model, 0 where filled. model: (n, m, m) without the sky.
     """
 
     x: np.ndarray
@@ -42,39 +48,47 @@ class Fit:
     residual: np.ndarray
     model: np.ndarray
 
-    def covariance(self, noise: np.ndarray, gain: float) -> np.ndarray:
-        """(n, 6, 6) for a noise (n,) of each pixel without light and `gain` of variance for each unit of light."""
-        return noise[:, None, None] ** 2 * self.bread + gain * (self.bread @ self.light @ self.bread)
+    def place_covariance(self, noise: np.ndarray, gain: float) -> np.ndarray:
+        """(n, 2, 2) of x, y for a noise (n,) of each pixel without light and `gain` of variance for each unit of light."""
+        rows = self.bread[:, 2:4]
+        out = ((noise / self.flux) ** 2)[:, None, None] * rows[:, :, 2:4]
+        return out + (gain / self.flux)[:, None, None] * (rows @ self.light @ rows.transpose(0, 2, 1))
 
 
-def _factors(
-    x: np.ndarray, y: np.ndarray, flux: np.ndarray, sigma: np.ndarray, half: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """U (n, 6, m) along y and V (n, 6, m) along x: column k of the Jacobian is the outer product of row k of both.
+def _factors(p: np.ndarray, half: int) -> np.ndarray:
+    """F (2, n, 4, m) along x and along y: the share of a Gaussian in each pixel, one, the share's derivatives by centre and by
+    width, for parameters p (n, 6) as in `fit`.
 
-    Along each axis: the share of a Gaussian in each pixel, its derivatives by centre and by width.
+    A column of the Jacobian over the flux is the outer product of a row along y and one along x (`_ALONG_Y`, `_ALONG_X`).
     """
-    n, m = len(x), 2 * half + 1
-    inverse = 1.0 / sigma.T[:, :, None]
-    t = (np.arange(-half, half + 2) - 0.5 - np.stack([x, y])[:, :, None]) * inverse
-    bell = np.exp(-0.5 * t * t)
+    n, m = len(p), 2 * half + 1
+    inverse = 1.0 / p.T[4:, :, None]
+    t = np.arange(-half - 0.5, half + 1.0, dtype=np.float32) - p.T[2:4, :, None]
+    t *= inverse
+    bell = t * t
+    bell *= np.float32(-0.5)
+    np.exp(bell, out=bell)
     # Abramowitz and Stegun 7.1.26 (error below 1.5e-7): the exponential is at hand, and scipy.special takes 0.3 s to import.
-    k = 1.0 / (1.0 + 0.3275911 * np.sqrt(0.5) * np.abs(t))
-    tail = k * (_ERF[0] + k * (_ERF[1] + k * (_ERF[2] + k * (_ERF[3] + k * _ERF[4])))) * bell
-    whole = np.copysign(1.0 - tail, t)
-    slope = bell * (inverse / np.sqrt(2.0 * np.pi))
-    share = 0.5 * (whole[..., 1:] - whole[..., :-1])
-    by_centre = slope[..., :-1] - slope[..., 1:]
-    slope *= t
-    by_width = slope[..., :-1] - slope[..., 1:]
-    U, V = np.empty((n, 6, m)), np.empty((n, 6, m))
-    f = flux[:, None]
-    U[:, 0], U[:, 1] = share[1], 1.0
-    U[:, 2] = U[:, 4] = f * share[1]
-    U[:, 3], U[:, 5] = f * by_centre[1], f * by_width[1]
-    V[:, 0] = V[:, 3] = V[:, 5] = share[0]
-    V[:, 1], V[:, 2], V[:, 4] = 1.0, by_centre[0], by_width[0]
-    return U, V
+    k = np.abs(t)
+    k *= np.float32(0.3275911 * np.sqrt(0.5))
+    k += np.float32(1.0)
+    np.reciprocal(k, out=k)
+    tail = k * np.float32(_ERF[4])
+    for c in _ERF[3::-1]:
+        tail += np.float32(c)
+        tail *= k
+    tail *= bell
+    np.subtract(np.float32(1.0), tail, out=tail)
+    np.copysign(tail, t, out=tail)
+    bell *= inverse * np.float32(1.0 / np.sqrt(2.0 * np.pi))
+    F = np.empty((2, n, 4, m), np.float32)
+    np.subtract(tail[..., 1:], tail[..., :-1], out=F[:, :, 0])
+    F[:, :, 0] *= np.float32(0.5)
+    F[:, :, 1] = 1.0
+    np.subtract(bell[..., :-1], bell[..., 1:], out=F[:, :, 2])
+    bell *= t
+    np.subtract(bell[..., :-1], bell[..., 1:], out=F[:, :, 3])
+    return F
 
 
 def fit(
@@ -85,51 +99,93 @@ def fit(
 
     sky, noise: (n,) from around the window; the sky is known as well as the noise of 2 m pixels allows. width: (2,) expected
     sigma of the stars along x and y, px, relative spread `tight`. filled: (n, m, m) bool, pixels that say nothing.
+
+    Single precision: with everything over the flux the numbers are about one, and pixels have no more digits.
     """
     n, m, _ = windows.shape
     half = m // 2
-    data = windows.astype(float)
-    # x, y, flux and so on by column, as the parameters of `Fit`
-    p = np.empty((n, 6))
-    p[:, 0] = np.maximum(np.where(filled, 0.0, data - sky[:, None, None]).sum(axis=(1, 2)), noise)
-    p[:, 1], p[:, 2], p[:, 3], p[:, 4:] = sky, x, y, width
-    expected = np.concatenate([np.zeros((n, 1)), sky[:, None], np.zeros((n, 2)), np.tile(width, (n, 1))], axis=1)
-    prior = np.zeros((n, 6))
-    prior[:, 1] = 2.0 * m
-    prior[:, 4:] = np.maximum(noise, 1e-9)[:, None] ** 2 / (tight * width) ** 2
+    data = np.subtract(windows, sky[:, None, None], dtype=np.float32)
+    some = bool(filled.any())
+    noise = noise.astype(np.float32)
+    # flux, sky above the first guess, x, y, sigma_x, sigma_y
+    p = np.empty((n, 6), np.float32)
+    light = np.where(filled, np.float32(0.0), data) if some else data
+    p[:, 0] = np.maximum(light.sum(axis=(1, 2)), np.maximum(noise, 1e-6))
+    p[:, 1], p[:, 2], p[:, 3], p[:, 4:] = 0.0, x, y, width
+    expected = np.array([0.0, 0.0, 0.0, 0.0, width[0], width[1]], np.float32)
+    spread = (np.maximum(noise, 1e-9)[:, None] / (tight * width)).astype(np.float32)
     low, high = np.array([-np.inf, -half, -half, MIN_SIGMA, MIN_SIGMA]), np.array([np.inf, half, half, half, half])
-    going = np.arange(n)
+    low, high = low.astype(np.float32), high.astype(np.float32)
+    going = None
     for k in range(iterations):
-        q = p[going]
-        U, V = _factors(q[:, 2], q[:, 3], q[:, 0], q[:, 4:], half)
-        rest = data[going] - (q[:, 0, None] * U[:, 0])[:, :, None] * V[:, 0, None, :] - q[:, 1, None, None]
-        rest[filled[going]] = 0.0
-        A = _normal(U, V, prior[going])
-        g = np.sum((U @ rest) * V, axis=2) + prior[going] * (expected[going] - q)
-        step = np.linalg.solve(A, g[..., None])[..., 0]
+        q, d, blank = (p, data, filled) if going is None else (p[going], data[going], filled[going])
+        flux = q[:, :1]
+        F = _factors(q, half)
+        rest = d - _model(F, flux)
+        rest -= q[:, 1, None, None]
+        if some:
+            rest[blank] = 0.0
+        prior = _prior(spread if going is None else spread[going], flux, m)
+        A = _normal(F, prior)
+        g = (F[1] @ rest @ F[0].transpose(0, 2, 1)).reshape(-1, 16).take(_BY_BOTH, axis=1)
+        g /= flux
+        away = expected - q
+        away[:, 1:2] /= flux
+        g += prior * away
+        step = np.linalg.solve(A, g[:, :, None])[:, :, 0]
+        step[:, :2] *= flux
         np.clip(step[:, 2:], -0.5, 0.5, out=step[:, 2:])
-        p[going, 0] = np.maximum(q[:, 0] + step[:, 0], 0.1 * q[:, 0])
-        p[going, 1:] = np.clip(q[:, 1:] + step[:, 1:], low, high)
+        new = q + step
+        np.maximum(new[:, :1], np.float32(0.1) * flux, out=new[:, :1])
+        np.clip(new[:, 1:], low, high, out=new[:, 1:])
+        if going is None:
+            p = new
+        else:
+            p[going] = new
         if k:
-            least = np.minimum(A[:, 2, 2], A[:, 3, 3])  # a tenth of what noise leaves, or the absolute bound
-            going = going[np.abs(step[:, 2:4]).max(axis=1) > np.maximum(_STILL, 0.1 * noise[going] / np.sqrt(least))]
-            if not going.size:
+            # A tenth of what noise leaves, or the absolute bound.
+            least = np.minimum(A[:, 2, 2], A[:, 3, 3])
+            bound = np.float32(0.1) * (noise if going is None else noise[going]) / (flux[:, 0] * np.sqrt(least))
+            on = np.flatnonzero(np.abs(step[:, 2:4]).max(axis=1) > np.maximum(bound, _STILL))
+            if not on.size:
                 break
-    U, V = _factors(p[:, 2], p[:, 3], p[:, 0], p[:, 4:], half)
-    model = (p[:, 0, None] * U[:, 0])[:, :, None] * V[:, 0, None, :]
-    rest = data - model - p[:, 1, None, None]
-    rest[filled] = 0.0
-    light = ((U * U[:, :1]) @ U.transpose(0, 2, 1)) * ((V * V[:, :1]) @ V.transpose(0, 2, 1)) * p[:, 0, None, None]
-    bread = np.linalg.inv(_normal(U, V, prior))
-    return Fit(p[:, 2], p[:, 3], p[:, 0], p[:, 1], p[:, 4:], bread, light, rest, model)
+            going = on if going is None else going[on]
+    F, flux = _factors(p, half), p[:, :1]
+    model = _model(F, flux)
+    rest = data - model
+    rest -= p[:, 1, None, None]
+    if some:
+        rest[filled] = 0.0
+    by_light = ((F * F[:, :, :1]) @ F.transpose(0, 1, 3, 2)).reshape(2, n, 16)
+    light = (by_light[1].take(_BY_Y, axis=1) * by_light[0].take(_BY_X, axis=1)).reshape(n, 6, 6)
+    bread = np.linalg.inv(_normal(F, _prior(spread, flux, m)))
+    p = p.astype(float)
+    return Fit(p[:, 2], p[:, 3], p[:, 0], sky + p[:, 1], p[:, 4:], bread, light, rest, model)
 
 
-def _normal(U: np.ndarray, V: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """J^T J with the prior and a trace of damping, (n, 6, 6)."""
-    A = (U @ U.transpose(0, 2, 1)) * (V @ V.transpose(0, 2, 1))
-    k = np.arange(6)
-    A[:, k, k] = (A[:, k, k] + prior) * (1.0 + 1e-9)
-    return A
+def _model(F: np.ndarray, flux: np.ndarray) -> np.ndarray:
+    """Light (n, m, m) of each pixel for factors F and flux (n, 1)."""
+    return (flux * F[1, :, 0])[:, :, None] * F[0, :, 0, None, :]
+
+
+def _prior(spread: np.ndarray, flux: np.ndarray, m: int) -> np.ndarray:
+    """(n, 6) information on sky and widths over flux^2."""
+    prior = np.zeros((len(flux), 6), np.float32)
+    prior[:, 1] = 2.0 * m
+    np.square(spread / flux, out=prior[:, 4:])
+    return prior
+
+
+def _normal(F: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """J^T J over flux^2 with the prior and a trace of damping, (n, 6, 6)."""
+    n = len(prior)
+    gram = (F @ F.transpose(0, 1, 3, 2)).reshape(2, n, 16)
+    A = gram[1].take(_BY_Y, axis=1)
+    A *= gram[0].take(_BY_X, axis=1)
+    diagonal = A[:, ::7]
+    diagonal += prior
+    diagonal *= np.float32(1.0 + 1e-6)
+    return A.reshape(n, 6, 6)
 
 
 def gain_of(f: Fit, noise: np.ndarray, use: np.ndarray) -> float:
@@ -139,13 +195,16 @@ def gain_of(f: Fit, noise: np.ndarray, use: np.ndarray) -> float:
     noise^2 (pixels - parameters) + gain (sum of light - trace(bread light)). For sharp optics that last bracket is a small part
     of the light. The median over stars: one double star or one hot pixel does not decide.
     """
-    if not use.any():
+    some = np.flatnonzero(use)
+    if not some.size:
         return 0.0
-    r = f.residual[use]
-    total = f.model[use].sum(axis=(1, 2))
-    left = np.maximum(total - np.einsum("nij,nji->n", f.bread[use], f.light[use]), 0.02 * total)
-    excess = np.sum(r**2, axis=(1, 2)) - noise[use] ** 2 * (r[0].size - _PARAMETERS)
-    return float(max(np.median(excess / left), 0.0))
+    r = f.residual[some].reshape(len(some), -1)
+    total = f.model[some].sum(axis=(1, 2))
+    taken = f.flux[some] * (f.bread[some] * f.light[some]).sum(axis=(1, 2))
+    left = np.maximum(total - taken, 0.02 * total)
+    excess = np.einsum("ij,ij->i", r, r) - noise[some] ** 2 * (r.shape[1] - _PARAMETERS)
+    ratio = np.sort(excess / left)
+    return float(max(0.5 * (ratio[(len(ratio) - 1) // 2] + ratio[len(ratio) // 2]), 0.0))
 
 
 __all__ = ["ITERATIONS", "MIN_SIGMA", "Fit", "fit", "gain_of"]

@@ -27,6 +27,7 @@ _FEW = 6  # stars; fewer do not confirm what is believed of the optics
 _FULL = 9  # px
 _SAME = 0.2  # of the logarithm of the width
 _FOR_WIDTH = 24  # stars whose widths tell the optics
+_WEIGHTS = np.pad(np.outer([1, 2, 1], [1, 2, 1]), 1).astype(np.float32).ravel()
 _WIDTH = (0.8, 1.5, 3.0)  # sigma expected of a star found at each level, px
 
 
@@ -282,10 +283,14 @@ def _merged(found: list[tuple[np.ndarray, ...]], s: DetectionSettings) -> tuple[
     """The places of all levels, the strongest of each neighbourhood, the strongest first."""
     merged = [np.concatenate(c) for c in zip(*found)]
     order = _strongest(merged[3], 3 * s.max_stars)
-    x, y, level = (c[order] for c in merged[:3])
-    reach = np.array(HALF)[level]
-    near = np.maximum(np.abs(x[:, None] - x), np.abs(y[:, None] - y)) <= reach  # of the stronger one, in the columns
-    first = order[~np.any(np.tril(near, -1), axis=1)][: 5 * s.max_stars // 4]
+    x, y, level = (c[order].astype(np.float32) for c in merged[:3])
+    reach = np.array(HALF, np.float32)[level.astype(int)]
+    near = np.abs(x[:, None] - x) <= reach  # of the stronger one, in the columns
+    near &= np.abs(y[:, None] - y) <= reach
+    i, j = np.divmod(np.flatnonzero(near), len(order))
+    near_stronger = np.zeros(len(order), bool)
+    near_stronger[i[j < i]] = True
+    first = order[~near_stronger][: 5 * s.max_stars // 4]
     return tuple(c[first] for c in merged)
 
 
@@ -297,18 +302,21 @@ def _strongest(values: np.ndarray, count: int) -> np.ndarray:
 def _around(array: np.ndarray, x: np.ndarray, y: np.ndarray, half: int) -> np.ndarray:
     """Windows (n, m, m), float32, edges repeated."""
     d = np.arange(-half, half + 1)
-    rows = np.clip(y[:, None] + d, 0, array.shape[0] - 1)
-    columns = np.clip(x[:, None] + d, 0, array.shape[1] - 1)
-    return array[rows[:, :, None], columns[:, None, :]].astype(np.float32)
+    height, width = array.shape
+    rows, columns = y[:, None] + d, x[:, None] + d
+    if x.size and not (x.min() >= half and y.min() >= half and x.max() < width - half and y.max() < height - half):
+        np.clip(rows, 0, height - 1, out=rows)
+        np.clip(columns, 0, width - 1, out=columns)
+    return array.reshape(-1).take((rows * width)[:, :, None] + columns[:, None, :]).astype(np.float32)
 
 
 def _wider_than_a_pixel(array: np.ndarray, peaks: Peaks, quantum: float) -> np.ndarray:
     """Which places of level 0 have light beside their brightest pixel, in both directions, as even the sharpest optics give."""
     w = _around(array, peaks.x, peaks.y, 2)
     # The filter is 16 times the local mean of light: sky in a pixel from the filtered value's.
-    f = (w[:, 1:4, 1:4] * np.outer([1, 2, 1], [1, 2, 1])).sum(axis=(1, 2))
-    sky = (f - peaks.excess) / 16.0
-    noise = peaks.noise / 6.0
+    f = w.reshape(len(w), 25) @ _WEIGHTS
+    sky = (f - peaks.excess) / np.float32(16.0)
+    noise = peaks.noise / np.float32(6.0)
     w -= sky[:, None, None]
     n = np.arange(len(w))
     j, i = np.divmod(np.argmax(w[:, 1:4, 1:4].reshape(len(w), 9), axis=1), 3)
@@ -359,44 +367,58 @@ class _Windows:
 def _windows(
     array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, half: int, floor: np.ndarray | float
 ) -> _Windows:
-    w = _around(array, x, y, half + _BORDER)
-    ring = w[:, _ring(half)]
+    reach, n = half + _BORDER, len(x)
+    w = _around(array, x, y, reach)
+    border, steps_from, steps_to = _ring(half)
+    pixels = w.reshape(n, -1)
+    ring = pixels.take(border, axis=1)
     ordered = np.sort(ring, axis=1)
     count = ring.shape[1]
     sky = ordered[:, int(0.2 * count) : int(0.8 * count)].mean(axis=1)
     noise = np.maximum((ordered[:, int(0.8413 * count)] - ordered[:, int(0.1587 * count)]) / 2, floor)
-    whole = np.arange(-half - _BORDER, half + _BORDER + 1)
-    off_y, off_x = y[:, None] + whole, x[:, None] + whole
-    off_y, off_x = (off_y < 0) | (off_y >= array.shape[0]), (off_x < 0) | (off_x >= array.shape[1])
-    off = off_y[:, :, None] | off_x[:, None, :]
-    ring = np.where(off[:, _ring(half)], sky[:, None], ring)  # what an edge repeats is no structure
-    outside = off[:, _BORDER:-_BORDER, _BORDER:-_BORDER]
     inner = w[:, _BORDER:-_BORDER, _BORDER:-_BORDER]
+    above = np.maximum(inner - sky[:, None, None], np.float32(0.0))
     full = inner >= 0.98 * image.saturation
-    above = np.maximum(inner - sky[:, None, None], 0.0) * ~outside
-    core = above[:, half - 2 : half + 3, half - 2 : half + 3] + 1e-9
-    d, total = np.arange(-2, 3), core.sum(axis=(1, 2))
-    x0, y0 = (core.sum(axis=1) * d).sum(axis=1) / total, (core.sum(axis=2) * d).sum(axis=1) / total
+    outside = np.zeros(inner.shape, bool)
+    at_edge = np.flatnonzero((x < reach) | (y < reach) | (x >= array.shape[1] - reach) | (y >= array.shape[0] - reach))
+    if at_edge.size:
+        whole = np.arange(-reach, reach + 1)
+        off_y, off_x = y[at_edge, None] + whole, x[at_edge, None] + whole
+        off_y, off_x = (off_y < 0) | (off_y >= array.shape[0]), (off_x < 0) | (off_x >= array.shape[1])
+        off = off_y[:, :, None] | off_x[:, None, :]
+        # What an edge repeats is no structure.
+        beyond = off.reshape(len(off), -1).take(border, axis=1)
+        ring[at_edge] = np.where(beyond, sky[at_edge, None], ring[at_edge])
+        outside[at_edge] = off[:, _BORDER:-_BORDER, _BORDER:-_BORDER]
+        above *= ~outside
+    core = above[:, half - 2 : half + 3, half - 2 : half + 3] + np.float32(1e-9)
+    d, rows, columns = np.arange(-2, 3, dtype=np.float32), core.sum(axis=2), core.sum(axis=1)
+    total = rows.sum(axis=1)
     # From pixel to pixel along the border's rows and columns: structure that is smooth does not count as noise here.
-    steps = [np.diff(w[:, [0, -1], :], axis=2), np.diff(w[:, :, [0, -1]], axis=1)]
-    steps = np.sort(np.abs(np.concatenate([d.reshape(len(w), 2 * w.shape[1] - 2) for d in steps], axis=1)), axis=1)
+    steps = np.sort(np.abs(pixels.take(steps_to, axis=1) - pixels.take(steps_from, axis=1)), axis=1)
     grain = np.minimum(noise, np.maximum(steps[:, int(0.6827 * steps.shape[1])] / np.sqrt(2.0), floor))
+    x0, y0 = columns @ d / total, rows @ d / total
     return _Windows(inner, ring, full, full | outside, outside, sky, noise, grain, above, x0, y0)
 
 
 @cache
-def _ring(half: int) -> np.ndarray:
-    """Mask (m, m) of the border around a window."""
-    mask = np.ones((2 * (half + _BORDER) + 1,) * 2, bool)
+def _ring(half: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Flat indices into a window (m, m) of the border around it, and of neighbours along its outermost rows and columns."""
+    m = 2 * (half + _BORDER) + 1
+    mask = np.ones((m, m), bool)
     mask[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
-    return mask
+    at = np.arange(m * m).reshape(m, m)
+    rows, columns = at[[0, -1]], at[:, [0, -1]]
+    before = np.concatenate([rows[:, :-1].ravel(), columns[:-1].ravel()])
+    after = np.concatenate([rows[:, 1:].ravel(), columns[1:].ravel()])
+    return np.flatnonzero(mask), before, after
 
 
 @cache
 def _sectors(half: int) -> tuple[np.ndarray, np.ndarray]:
     """Ring pixels in the order of the eight directions they lie in, and where each direction starts."""
     d = np.arange(-half - _BORDER, half + _BORDER + 1)
-    angle = np.arctan2(d[:, None], d[None, :])[_ring(half)]
+    angle = np.arctan2(d[:, None], d[None, :]).ravel()[_ring(half)[0]]
     number = np.rint(angle / (np.pi / 4)).astype(int) % 8
     order = np.argsort(number, kind="stable")
     return order, np.searchsorted(number[order], np.arange(8))
@@ -421,7 +443,8 @@ def _in_structure(w: _Windows, half: int) -> np.ndarray:
     """Which places lie on a ridge (both sides of the ring bright along one line) or at the edge of something large."""
     peak = np.max(w.above[:, half - 1 : half + 2, half - 1 : half + 2], axis=(1, 2))
     order, starts = _sectors(half)
-    ring = (w.ring - w.sky[:, None])[:, order]
+    ring = w.ring.take(order, axis=1)
+    ring -= w.sky[:, None]
     most = np.maximum.reduceat(ring, starts, axis=1)
     mean = np.add.reduceat(ring, starts, axis=1) / np.diff(np.append(starts, ring.shape[1]))
     ridge = (np.minimum(most[:, :4], most[:, 4:]) > (0.3 * peak + 3.5 * w.grain)[:, None]).any(axis=1)
@@ -436,23 +459,24 @@ def _measure(
     half = HALF[level]
     rounding = quantum / np.sqrt(12.0)
     w = _windows(array, image, x, y, half, np.minimum(floor, rounding))
-    calm = ~_in_structure(w, half)
-    if not calm.any():
+    calm = np.flatnonzero(~_in_structure(w, half))
+    if not calm.size:
         return _nothing()
-    x, y, snr, floor = x[calm], y[calm], snr[calm], floor[calm]
-    w = _Windows(**{k: v[calm] for k, v in vars(w).items()})
+    if calm.size < len(x):
+        x, y, snr, floor = x[calm], y[calm], snr[calm], floor[calm]
+        w = _Windows(**{k: v[calm] for k, v in vars(w).items()})
     expected = np.full(2, _WIDTH[level]) if width is None else width
     f = fit(w.inner, w.x0, w.y0, w.sky, w.noise, expected, w.filled, 0.25 if width is not None else 0.35)
     clear = (snr > _BRIGHT) & ~w.filled.any(axis=(1, 2))
     gain = s.gain if s.gain is not None else gain_of(f, w.noise, clear)
     # Noise with a pattern (mosaics, JPEG) is larger in sums of pixels than its pixels say; the filtered image shows it.
     real = np.maximum(w.noise, floor)
-    position = f.covariance(real, gain)[:, 2:4, 2:4]
-    misfit = np.mean(f.residual**2 / (real[:, None, None] ** 2 + gain * f.model), axis=(1, 2))
+    position = f.place_covariance(real, gain)
+    expected = (real**2).astype(np.float32)[:, None, None] + np.float32(gain) * f.model
+    misfit = (np.square(f.residual) / expected).mean(axis=(1, 2))
     position *= np.where(misfit > _MISFIT, misfit, 1.0)[:, None, None]
-    position += s.optics_px**2 * np.eye(2)
     saturated = np.asarray(w.full.any(axis=(1, 2)))
-    position[saturated] += 0.1**2 * np.eye(2)
+    position[:, [0, 1], [0, 1]] += (s.optics_px**2 + 0.1**2 * saturated)[:, None]
     noise, above = w.noise, w.above
     star = _is_star(f, noise, half, s)
     if widths is not None:
@@ -468,8 +492,8 @@ def _measure(
 def _is_star(f: Fit, noise: np.ndarray, half: int, s: DetectionSettings) -> np.ndarray:
     """Which fits look like a star: centred, neither a pixel nor a plane, and more light than the roughness around them."""
     wide, narrow = f.sigma.max(axis=1), f.sigma.min(axis=1)
-    light = np.sum(f.model**2, axis=(1, 2))
-    explained = light / (light + np.sum(f.residual**2, axis=(1, 2)))
+    light = np.einsum("nij,nij->n", f.model, f.model)
+    explained = light / (light + np.einsum("nij,nij->n", f.residual, f.residual))
     return (
         (f.flux > 0.6 * s.threshold * noise * np.sqrt(4 * np.pi * wide * narrow))
         & (np.maximum(np.abs(f.x), np.abs(f.y)) < 0.6 * half)
@@ -480,25 +504,31 @@ def _is_star(f: Fit, noise: np.ndarray, half: int, s: DetectionSettings) -> np.n
 
 def _elongation(above: np.ndarray, f: Fit, half: int) -> np.ndarray:
     """Longer over shorter axis (n,) of the light's second moments under a window of twice its width."""
-    d = np.arange(-half, half + 1)
-    dx, dy = d - f.x[:, None], d - f.y[:, None]
-    reach = 2.0 * f.sigma.max(axis=1)[:, None] + 0.5
-    weight = above * np.exp(-0.5 * (dy / reach) ** 2)[:, :, None] * np.exp(-0.5 * (dx / reach) ** 2)[:, None, :]
-    total = weight.sum(axis=(1, 2)) + 1e-12
-    xx = (weight.sum(axis=1) * dx**2).sum(axis=1) / total
-    yy = (weight.sum(axis=2) * dy**2).sum(axis=1) / total
-    xy = np.einsum("nij,ni,nj->n", weight, dy, dx) / total
+    d = np.arange(-half, half + 1, dtype=np.float32)
+    away = d - np.stack([f.x, f.y])[:, :, None].astype(np.float32)
+    reach = (2.0 * f.sigma.max(axis=1) + 0.5).astype(np.float32)
+    basis = np.empty((2, len(f.x), 3, d.size), np.float32)  # the window's weight along x and y, times 1, d, d^2
+    basis[:, :, 0] = np.exp(np.float32(-0.5) * np.square(away / reach[:, None]))
+    np.multiply(basis[:, :, 0], away, out=basis[:, :, 1])
+    np.multiply(basis[:, :, 1], away, out=basis[:, :, 2])
+    moments = basis[1] @ above @ basis[0].transpose(0, 2, 1)
+    total = moments[:, 0, 0] + 1e-12
+    xx, yy, xy = moments[:, 0, 2] / total, moments[:, 2, 0] / total, moments[:, 1, 1] / total
     middle, swing = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     return np.sqrt((middle + swing) / np.maximum(middle - swing, 0.02 * middle + 1e-12))
 
 
 def _alone(stars: Centroids) -> np.ndarray:
     """Indices of stars that are not a second finding, or an artefact, of a brighter one close by; brightest first."""
-    x, y, flux = stars.x_px, stars.y_px, stars.flux
-    d2 = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
-    brighter = np.arange(len(x)) < np.arange(len(x))[:, None]
-    same = (d2 < 4.0) | ((d2 < 14.0**2) & (flux[:, None] < 0.01 * flux))
-    return np.flatnonzero(~np.any(same & brighter, axis=1))
+    x, y, flux = stars.x_px.astype(np.float32), stars.y_px.astype(np.float32), stars.flux
+    i, j = np.divmod(np.flatnonzero(np.abs(x[:, None] - x) < 14.0), max(len(x), 1))
+    later = np.flatnonzero((j < i) & (np.abs(y[i] - y[j]) < 14.0))
+    i, j = i[later], j[later]
+    d2 = (x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2
+    same = (d2 < 4.0) | ((d2 < 14.0**2) & (flux[i] < 0.01 * flux[j]))
+    keep = np.ones(len(x), bool)
+    keep[i[same]] = False
+    return np.flatnonzero(keep)
 
 
 __all__ = ["HALF", "DetectionSettings", "Optics", "dark_of", "detect", "detect_near", "detect_next"]

@@ -16,7 +16,6 @@ from .background import PER_TILE, mesh_of
 TILES = (64, 48, 32)
 """Side of a tile of the sky's mesh at each level, in its own pixels."""
 _BAND = 128
-_ROWS = 8  # share one threshold
 WEIGHT = 16.0
 """Sum of the filter's weights."""
 _NOISE = 6.0  # root of the sum of their squares: from a pixel's noise to the filtered noise
@@ -49,25 +48,23 @@ def halve(array: np.ndarray) -> np.ndarray:
 
 
 def filtered(array: np.ndarray, out: np.dtype) -> np.ndarray:
-    """[1 2 1] x [1 2 1] of an array (h, w): (h - 2, w - 2), the sum of weights is 16."""
-    a = array if array.dtype == out else array.astype(out)
-    a = a[:-1] + a[1:]
-    a = a[:-1] + a[1:]
-    a = a[:, :-1] + a[:, 1:]
-    return a[:, :-1] + a[:, 1:]
+    """[1 2 1] x [1 2 1] of an array (h, w): (h - 2, w), the sum of weights is 16. The last two columns mean nothing.
 
-
-def _sampled(array: np.ndarray, stride: int, out: np.dtype) -> np.ndarray:
-    """The filtered image at every stride-th pixel both ways, without filtering the others."""
-    total: np.ndarray | None = None
+    Rows run on into each other: sums along one long line take half the time of sums along each row.
+    """
     h, w = array.shape
-    for dy, wy in ((0, 1), (1, 2), (2, 1)):
-        rows = array[dy : h - 2 + dy : stride]
-        line = rows[:, 0 : w - 2 : stride].astype(out) + rows[:, 2:w:stride]
-        line += 2 * rows[:, 1 : w - 1 : stride].astype(out)
-        total = line * out.type(wy) if total is None else total + line * out.type(wy)
-    assert total is not None
-    return total
+    result = np.empty((h - 2, w), out)
+    one, two = np.empty((min(_BAND, h) + 2, w), out), np.empty((min(_BAND, h) + 2, w), out)
+    for top in range(0, h - 2, _BAND):
+        n = min(_BAND, h - 2 - top)
+        one[: n + 2] = array[top : top + n + 2]
+        np.add(one[: n + 1], one[1 : n + 2], out=two[: n + 1])
+        np.add(two[:n], two[1 : n + 1], out=one[:n])
+        line, other, into = one[:n].reshape(-1), two[:n].reshape(-1), result[top : top + n].reshape(-1)
+        np.add(line[:-1], line[1:], out=other[:-1])
+        np.add(other[:-2], other[1:-1], out=into[:-2])
+    result[-1, -2:] = 0
+    return result
 
 
 def find_peaks(array: np.ndarray, level: int, threshold: float, quantum: float) -> Peaks:
@@ -80,45 +77,25 @@ def find_peaks(array: np.ndarray, level: int, threshold: float, quantum: float) 
     tile = TILES[level]
     stride = max(1, tile // PER_TILE)
     floor = quantum / np.sqrt(12.0) * 2**level * _NOISE
-    mesh = mesh_of(_sampled(array, stride, out), (h - 2, w - 2), tile, floor)
-    limits = mesh.limit(threshold, _ROWS)
+    f = filtered(array, out)
+    mesh = mesh_of(f[::stride, : w - 2 : stride], (h - 2, w - 2), tile, floor)
+    lower, rows = mesh.least(threshold)
     if out == np.uint16:  # one type on both sides is compared many pixels at a time
-        limits = np.clip(np.floor(limits), 0, np.iinfo(np.uint16).max).astype(np.uint16)
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
-    for top in range(0, h - 2, _BAND):  # rows of the filtered image, with one more on each side for their neighbours
-        bottom = min(top + _BAND, h - 2)
-        f = filtered(array[max(top - 1, 0) : min(bottom + 3, h)], out)
-        first = top - max(top - 1, 0)
-        inner = f[first : first + bottom - top]
-        high = np.empty(inner.shape, bool)
-        whole = len(inner) // _ROWS * _ROWS
-        blocks = limits[top // _ROWS :]
-        np.greater(
-            inner[:whole].reshape(-1, _ROWS, w - 2),
-            blocks[: whole // _ROWS, None],
-            out=high[:whole].reshape(-1, _ROWS, w - 2),
-        )
-        if whole < len(inner):
-            np.greater(inner[whole:], blocks[whole // _ROWS], out=high[whole:])
-        high[:, 0] = high[:, -1] = False
-        high[: 1 - first], high[len(high) - (bottom == h - 2) :] = False, False
-        at = np.flatnonzero(high)
-        if not at.size:
-            continue
-        y, x = np.divmod(at, w - 2)
-        place = at + first * (w - 2)
-        flat = f.ravel()
-        value = flat[place]
-        keep = np.ones(len(place), bool)
-        for step in (1, w - 3, w - 2, w - 1):  # a plateau has one maximum: its last pixel
-            keep &= (value >= flat[place - step]) & (value > flat[place + step])
-        found.append((x[keep], y[keep] + top, value[keep].astype(np.float32)))
-    if not found:
-        nothing = np.zeros(0)
-        return Peaks(nothing.astype(int), nothing.astype(int), nothing, nothing)
-    x, y, value = (np.concatenate(c) for c in zip(*found))
+        lower = np.clip(np.floor(lower), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+    high = np.zeros((h - 2, w), bool)
+    for k in range(len(lower)):
+        band = slice(max(int(rows[k]), 1), min(int(rows[k + 1]), h - 3))
+        np.greater(f[band, 1 : w - 3], lower[k, 1:-1], out=high[band, 1 : w - 3])
+    place, flat = np.flatnonzero(high), f.reshape(-1)
+    value = flat.take(place)
+    for step in (1, w - 1, w, w + 1):  # a plateau has one maximum: its last pixel
+        keep = np.flatnonzero((value >= flat.take(place - step)) & (value > flat.take(place + step)))
+        place, value = place.take(keep), value.take(keep)
+    y, x = np.divmod(place, w)
     sky, noise = mesh.at(y, x)
-    return Peaks(x + 1, y + 1, value - sky, noise)
+    excess = value.astype(np.float32) - sky
+    keep = np.flatnonzero(excess > np.float32(threshold) * noise)
+    return Peaks(x[keep] + 1, y[keep] + 1, excess[keep], noise[keep])
 
 
 __all__ = ["TILES", "WEIGHT", "Peaks", "filtered", "find_peaks", "halve", "wide"]
