@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from . import approach, li2007, zhou2021
 from . import campaign_figures as parts
-from . import li2007, zhou2021
 from .campaign_data import Campaign
 from .campaign_table import add_summary_table, headline
 from .claims import Claim, add_claims
@@ -43,7 +43,7 @@ def monte_carlo_page(dataset: xarray.Dataset, summary: dict[str, Any], claims: S
         subtitle=f"Scenario `{campaign.scenario}`, {runs} of {int(campaign.update[-1])} updates, seed {campaign.seed}",
     )
     page.section("Result")
-    own: Any = {"zhou2021": zhou2021, "li2007": li2007}.get(str(campaign.attrs.get("experiment")))
+    own: Any = {"zhou2021": zhou2021, "li2007": li2007, "approach": approach}.get(str(campaign.attrs.get("experiment")))
     page.headline(*(own.headline(summary) if own else headline(campaign)))
     if campaign.runs < campaign.requested:
         page.notice(

@@ -47,6 +47,10 @@ _ESTIMATORS = {
     "batch": (INK, "x"),
     "ekf_position_velocity": (RED, "cross"),
     "ekf_position_velocity_pointing": (SKY, "circle"),
+    "ekf_srp_ignored": (ORANGE, "square-open"),
+    "ekf_execution_ignored": (PINK, "triangle-up-open"),
+    "no_manoeuvres": (GREEN, "diamond-open"),
+    "no_frames": (RED, "triangle-down-open"),
 }
 _OTHERS = [(SKY, "circle"), (ORANGE, "square"), (GREEN, "diamond"), (PINK, "triangle-up"), (VIOLET, "triangle-down")]
 TUNED = "_tuned"

@@ -13,6 +13,8 @@ def print_campaign(summary: dict[str, Any]) -> None:
     """One line for each estimator, at most 88 columns."""
     if any("drift_rms_deg_h" in m for m in summary["estimators"].values()):
         return _print_attitude_and_drift(summary)
+    if any("delivery_error_km" in m for m in summary["estimators"].values()):
+        return _print_approach(summary)
     if any("last60_error_km" in m for m in summary["estimators"].values()):
         return _print_position(summary)
     runs = summary["runs"]
@@ -79,6 +81,20 @@ def _print_position(summary: dict[str, Any]) -> None:
         print("".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))))
     print("mean: |truth - estimate| over runs and frames; NEES/n: 1 when consistent;")
     print("diverged: runs more than 5 km off over the last 60 s")
+
+
+def _print_approach(summary: dict[str, Any]) -> None:
+    print(f"{summary['scenario']}: {summary['runs']} runs, seed {summary['seed']}, {summary['wall_s']:.1f} s")
+    heads = ("estimator", "miss km", "99%", "dv m/s", "99%", "end x", "y", "z km", "NEES/6")
+    widths = (22, 10, 10, 7, 7, 9, 9, 9, 8)
+    print("".join(h.ljust(w) if i == 0 else h.rjust(w) for i, (h, w) in enumerate(zip(heads, widths, strict=True))))
+    for name, m in summary["estimators"].items():
+        miss, dv = m["delivery_error_km"], m["delta_v_m_s"]
+        values = (miss["rms"], miss["q99"], dv["mean"], dv["q99"], *m["handover_error_km"]["rms"], m["nees_per_state"])
+        row = (name, *(_number(v) for v in values))
+        print("".join(c.ljust(w) if i == 0 else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True))))
+    print("miss: of the aim in the target plane, RMS; dv: delta-v of a run, mean;")
+    print("end: error of the relative position at the last frame, RMS; NEES/6: 1 when consistent")
 
 
 def print_attitude(result: dict[str, Any]) -> None:
