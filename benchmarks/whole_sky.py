@@ -116,7 +116,7 @@ def write_report(cells: list[dict[str, Any]], path: Path, command: str) -> Path:
         "with 0.3 px noise and magnitudes good to 0.3 mag; one thing at a time is made worse. No prior attitude is used; the "
         "field is known to 0.1%.",
     )
-    page.headline(f"{wrong} of {total} solutions were false.")
+    page.headline(f"{wrong} of {total} scenes were given a false solution.")
     for sweep, (title, unit, values) in SWEEPS.items():
         page.section(title)
         page.figure(

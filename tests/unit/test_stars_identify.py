@@ -282,3 +282,12 @@ def test_screening_agrees_with_verification():
     assert odds[2] < 0.0
     # One step leads from 2 mrad to a tenth of a pixel or so.
     assert np.abs(stepped[0] - stepped[1]).max() < 1e-4
+
+
+def test_no_few_detections_decide_for_all_pairs():
+    """Of these 110 detections the first forty that a common order of tests would take hold hardly a star."""
+    c = camera(20)
+    s = scene(default_sky(), c, np.random.default_rng([41, 5]), false=80)
+    found = identify(s.xy_px, c, flux=s.flux, sigma_px=0.3)
+    assert found.solved
+    assert (found.stars == s.star[found.detections]).mean() > 0.9

@@ -250,12 +250,12 @@ def _laid(d: Detections, i, j, f: np.ndarray, va: np.ndarray, vb: np.ndarray) ->
 
 
 def _coordinates(d: Detections, i: np.ndarray, j: np.ndarray, tests: np.ndarray) -> np.ndarray:
-    """T (m, 3, t): a, 1 - a and e (see `_laid`) of the detections `tests` for pairs i, j (m,)."""
+    """T (m, 3, t): a, 1 - a and e (see `_laid`) of the detections `tests` (m, t) for pairs i, j (m,)."""
     xi, xj = d.xy[i], d.xy[j]
     u = xi - xj
     t = d.xy[tests]
-    a = ((t[None] - xj[:, None]) * u[:, None]).sum(axis=2) / (u * u).sum(axis=1, keepdims=True)
-    e = t[None, :, 0] * u[:, None, 1] - t[None, :, 1] * u[:, None, 0] + (xi[:, :1] * xj[:, 1:] - xj[:, :1] * xi[:, 1:])
+    a = ((t - xj[:, None]) * u[:, None]).sum(axis=2) / (u * u).sum(axis=1, keepdims=True)
+    e = t[:, :, 0] * u[:, None, 1] - t[:, :, 1] * u[:, None, 0] + (xi[:, :1] * xj[:, 1:] - xj[:, :1] * xi[:, 1:])
     return np.stack([a, 1.0 - a, e], axis=1).astype(np.float32)
 
 
@@ -274,13 +274,12 @@ def _rank(level: Level, d: Detections, i, j, a, b, zero, freedom: Freedom, keep:
         f = np.full(len(i), freedom.f_known)
     M = _laid(d, i, j, f.astype(np.float32), va, vb)
     sky_map = level.sky_map(FAINT, tolerance_px(d, freedom) / float(np.median(f)))
-    # The first test takes bright and faint ones alike: the brightest few may all be false.
-    tests = np.concatenate([np.arange(k, len(d), 3) for k in range(3)]).astype(int)
-    score = 2.0 + _score(sky_map, d, M, i, j, zero, tests[:FIRST_TEST])
+    few = min(FIRST_TEST, len(d))
+    score = 2.0 + _score(sky_map, d, M, i, j, zero, slice(0, few))
     best = np.sort(_largest(score, max(FIRST_KEPT, keep, int(FIRST_SHARE * len(f)))))
     if len(d) > FIRST_TEST:
         some = None if zero is None else zero[best]
-        score[best] += _score(sky_map, d, M[:, best], i[best], j[best], some, tests[FIRST_TEST:])
+        score[best] += _score(sky_map, d, M[:, best], i[best], j[best], some, slice(few, len(d)))
     best = best[_largest(score[best], keep)]
     va, vb = (level.directions[k[best]] for k in (a, b))
     return Hypotheses(rotations(d, i[best], j[best], f[best], va, vb), f[best], score[best])
@@ -296,38 +295,47 @@ def _largest(score: np.ndarray, keep: int) -> np.ndarray:
     return np.argsort(-score, kind="stable")
 
 
-def _score(
-    sky_map: SkyMap, d: Detections, M: np.ndarray, i, j, zero: np.ndarray | None, tests: np.ndarray
-) -> np.ndarray:
-    """Weighed hits (h,) of the detections `tests` other than i and j, under the hypotheses M (3, h, 3) of `_laid`.
+def _test_order(n: int, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """(m, n) the order in which n detections test the hypotheses of pairs i, j (m,).
+
+    Bright and faint ones alike come early, as the brightest few may all be false; and each pair starts elsewhere, as any few
+    may all be false: that must not fail every true pair at once.
+    """
+    mixed = np.concatenate([np.arange(k, n, 3) for k in range(3)])
+    return mixed[((31 * i + 17 * j)[:, None] + np.arange(n)) % n]
+
+
+def _score(sky_map: SkyMap, d: Detections, M: np.ndarray, i, j, zero: np.ndarray | None, which: slice) -> np.ndarray:
+    """Weighed hits (h,) of detections other than i and j, those at `which` of each pair's order, under M (3, h, 3) of `_laid`.
 
     Runs of hypotheses share their pair of detections: they are one matrix product.
     """
-    h, t = len(i), len(tests)
+    h = len(i)
     run = np.concatenate([[0], np.flatnonzero((np.diff(i) != 0) | (np.diff(j) != 0)) + 1, [h]])
-    T = _coordinates(d, i[run[:-1]], j[run[:-1]], tests)
-    place = np.full(len(d), -1)
-    place[tests] = np.arange(t)
+    at = run[:-1]
+    tests = _test_order(len(d), i[at], j[at])[:, which]
+    own = (tests == i[at][:, None]) | (tests == j[at][:, None])
+    T = _coordinates(d, i[at], j[at], tests)
     score = np.empty(h, dtype=np.float32)
-    v = np.empty((3, min(h, BLOCK), t), dtype=np.float32)
-    m = None if d.magnitude is None else d.magnitude[tests].astype(np.float32)
+    v = np.empty((3, min(h, BLOCK), tests.shape[1]), dtype=np.float32)
+    m = None if d.magnitude is None else d.magnitude.astype(np.float32)[tests]
     for begin in range(0, h, BLOCK):
         end = min(begin + BLOCK, h)
-        r0, r1 = np.searchsorted(run, [begin, end - 1], side="right")
-        own = []
-        for r in range(int(r0) - 1, int(r1)):
-            p, q = max(int(run[r]), begin), min(int(run[r + 1]), end)
-            np.matmul(M[:, p:q], T[r], out=v[:, p - begin : q - begin])
-            own += [(p - begin, q - begin, place[k]) for k in (i[p], j[p]) if place[k] >= 0]
+        r0 = int(np.searchsorted(run, begin, side="right")) - 1
+        r1 = int(np.searchsorted(run, end, side="left"))
+        edges = np.clip(run[r0 : r1 + 1], begin, end) - begin
+        for r in range(r0, r1):
+            p, q = edges[r - r0], edges[r - r0 + 1]
+            np.matmul(M[:, begin + p : begin + q], T[r], out=v[:, p:q])
         found = sky_map.cells.take(sky_map.index(v[0, : end - begin], v[1, : end - begin], v[2, : end - begin]))
-        for p, q, column in own:
-            found[p:q, column] = EMPTY
+        r = np.repeat(np.arange(r0, r1), np.diff(edges))
+        found[own[r]] = EMPTY
         if zero is None or m is None:
             score[begin:end] = np.count_nonzero(found != EMPTY, axis=1)
             continue
         # Empty cells look up a star so faint that its weight is nothing.
         z = MAGNITUDES.take(found)
-        z -= m
+        z -= m[r]
         z -= zero[begin:end, None]
         z *= np.float32(0.45 / np.hypot(1.3 * d.magnitude_sigma, 0.05))
         z *= z
