@@ -84,8 +84,7 @@ def flow(f: Forces, x: Approach, dt: Array, steps: int) -> Approach:
             k = _rate(f, x.s, at)
             return (y + now[0] * h * k, total + now[1] * h * k), None
 
-        (_, y), _ = jax.lax.scan(stage, (y, y), (reach, weight))
-        return y, None
+        return jax.lax.scan(stage, (y, y), (reach, weight))[0][1], None
 
     y, _ = jax.lax.scan(advance, jnp.concatenate([x.r, x.v, x.R, x.V]), None, length=steps)
     return Approach(y[:3], y[3:6], y[6:9], y[9:], x.s, x.c)

@@ -1,189 +1,38 @@
-"""The approach to a small body, assembled: truth, frames, filter, manoeuvres, and the hand-over to li2007's terminal tracking.
-
-Every epoch is one step of a scan: truth and estimate are propagated, a frame (where there is one) updates the estimate, and a
-manoeuvre (where there is one) is computed from the estimate, and executed on the truth with an error that the filter is told the
-covariance of. Estimators differ in data alone, so that all share one program.
-"""
+"""The approach to a small body, assembled: what is flown (approach_flight.py), every estimator by name, the bound, and the
+hand-over to li2007's terminal tracking. Estimators differ in data alone, so that all share one program."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 
 from ..backend import jax, jnp
-from ..core import Gaussian, Measurement, Model, no_gate, pytree
+from ..core import Model
 from ..evaluate import recursive_bound
-from ..filters import ErrorStateKalmanFilter
-from ..geometry import small, so3
 from ..models.approach import (
     MU_SUN,
     Approach,
     Execution,
     Forces,
     Target,
-    approach,
     approach_model,
-    body_pixel,
-    correction,
-    executed,
-    execution_cov,
     flow,
     passage,
-    predicted_passage,
-    walk_of,
 )
-from ..models.relative import Camera, Sight
+from ..models.relative import Camera
 from ..units import ARCSEC
 from .approach_data import DAY, KM, Draws, Setting, nominal_start, pressure, simulate, start_factor, timeline
+from .approach_flight import Choice, Epochs, Flight, attitude_cov, fly, linearised
 from .approach_specification import Specification
 from .approach_terminal import Terminal, terminal_tracking
 from .experiment import Call, Variable
-from .li2007_data import look_at
 
 Array = jax.Array
 LONGEST_STEP = 0.5 * DAY
 """Of the integration: over 100 days it leaves metres (tests/unit/test_approach.py)."""
-
-
-@pytree
-class Epochs:
-    """Timeline as data: dt, before (n,) s; frame, burn (n,) of bool; burns (m,): which epochs have a manoeuvre."""
-
-    dt: Array
-    before: Array
-    frame: Array
-    burn: Array
-    burns: Array
-
-
-@pytree
-class Flight:
-    """What every estimator shares. start: `Approach` of the orbit to the aim; L (14, 14) of `start_factor`; course: m/s;
-    attitude (3,) rad; least: smallest burn, m/s; half: half the image, px."""
-
-    start: Approach
-    L: Array
-    course: Array
-    attitude: Array
-    target: Target
-    execution: Execution
-    least: Array
-    half: Array
-
-
-@pytree
-class Choice:
-    """What an estimator is. frames, manoeuvres: whether it uses them; told: 1 where its covariance takes the burns' errors;
-    known (14,): 0 for a state that it takes as known (with no variance at the start), else 1."""
-
-    frames: Array
-    manoeuvres: Array
-    told: Array
-    known: Array
-
-
-_FILTER = ErrorStateKalmanFilter(approach)
-
-
-def _attitude_cov(camera: Camera, sigma: Array) -> Array:
-    """What the attitude's errors about the camera's x and y do to a body near the boresight, px^2 (2, 2): about x moves y."""
-    f = camera.K[:, :2]
-    return f @ jnp.diag(jnp.stack([sigma[1], sigma[0]]) ** 2) @ f.T
-
-
-def _look(model: Model, flight: Flight, truth: Approach, seen_from: Array, noise: Array) -> tuple[Array, Array, Sight]:
-    """Pixel and line of a frame that is turned to where the body is thought to be, whether it is in the field, and what is known
-    of the frame."""
-    camera = model.sensors[0].params
-    R_CN = look_at(-seen_from)
-    sight = Sight(R_CN, jnp.zeros(2), _attitude_cov(camera, flight.attitude))
-    turned = so3.exp(flight.attitude * noise[2:]) @ R_CN
-    z = body_pixel(camera, truth, Sight(turned, jnp.zeros(2), sight.cov)) + camera.sigma * noise[:2]
-    return z, jnp.all(jnp.abs(z - camera.p0) < flight.half), sight
-
-
-def _plan(
-    model: Model,
-    flight: Flight,
-    burn: Array,
-    told: Array,
-    truth: Approach,
-    belief: Gaussian,
-    left: Array,
-    normal: Array,
-) -> tuple[Approach, Gaussian, dict[str, Array]]:
-    """Where the estimate passes, and (burn) the manoeuvre that makes it pass at the aim, executed."""
-    forces = model.process.params
-    b, J = predicted_passage(forces, flight.target, belief.mean, left)
-    dv = correction(flight.target, b, J)
-    dv = jnp.where(burn & (jnp.sum(dv * dv) >= flight.least**2), dv, 0.0)
-    done = executed(flight.execution, dv, normal)
-    sigma = jnp.sqrt(jnp.diagonal(small.congruence(J, belief.cov)))
-    grown = belief.cov.at[3:6, 3:6].add(told * execution_cov(flight.execution, dv))
-    moved = replace(belief.mean, v=belief.mean.v + dv)
-    record = {"b": b, "b_sigma": sigma, "dv": dv, "done": done}
-    return replace(truth, v=truth.v + done), Gaussian(moved, grown), record
-
-
-def _no_plan(truth: Approach, belief: Gaussian) -> tuple[Approach, Gaussian, dict[str, Array]]:
-    zero = jnp.zeros(3)
-    return truth, belief, {"b": zero, "b_sigma": zero, "dv": zero, "done": zero}
-
-
-def fly(model: Model, flight: Flight, choice: Choice, epochs: Epochs, draws: Draws) -> tuple[Approach, Gaussian, Any]:
-    """One run: truth and belief at the last frame, and the record of every epoch."""
-    forces = model.process.params
-    course = replace(flight.start, v=flight.start.v + flight.course * draws.course)
-    truth = approach.boxplus(course, flight.L @ draws.start)
-    L = flight.L * choice.known[:, None]
-    belief = Gaussian(course, L @ L.T)
-    gate = no_gate(2)
-
-    def body(carry: tuple[Approach, Gaussian], now: Any) -> tuple[tuple[Approach, Gaussian], dict[str, Array]]:
-        truth, belief = carry
-        dt, before, frame, burn, plan, noise = now
-        truth = model.process.step(forces, truth, None, dt, walk_of(forces, dt, noise[:6]))
-        belief, _ = _FILTER.predict(belief, model.process, None, dt)
-        z, inside, sight = _look(model, flight, truth, belief.mean.r, noise[6:11])
-        seen = frame & choice.frames & inside
-        belief, info = _FILTER.update(belief, model.sensors[0], Measurement(z, sight, seen[None]), gate, jnp.asarray(0))
-        truth, belief, record = jax.lax.cond(
-            plan,
-            lambda truth, belief: _plan(
-                model, flight, burn & choice.manoeuvres, choice.told, truth, belief, before, noise[11:]
-            ),
-            _no_plan,
-            truth,
-            belief,
-        )
-        error = approach.boxminus(truth, belief.mean)
-        P = belief.cov
-        white = small.matvec(small.invert_lower(small.cholesky(P[:6, :6])), error[:6])
-        sigma = jnp.sqrt(jnp.diagonal(P))
-        record |= {
-            "position_error_km": error[:3] / KM,
-            "position_sigma_km": sigma[:3] / KM,
-            "velocity_error_m_s": error[3:6],
-            "velocity_sigma_m_s": sigma[3:6],
-            "ephemeris_error_km": error[6:9] / KM,
-            "ephemeris_sigma_km": sigma[6:9] / KM,
-            "radiation_error": error[12],
-            "radiation_sigma": sigma[12],
-            "nees_per_state": jnp.sum(white**2) / 6.0,
-            "nis": info.nis,
-            "seen": seen,
-        }
-        return (truth, belief), record
-
-    # Where the probe passes is predicted at manoeuvres and at the hand-over: it costs an integration each time.
-    plan = epochs.burn.at[-1].set(True)
-    inputs = (epochs.dt, epochs.before, epochs.frame, epochs.burn, plan, draws.noise)
-    (truth, belief), record = jax.lax.scan(body, (truth, belief), inputs)
-    return truth, belief, record
 
 
 @partial(jax.jit, static_argnames=("end",))
@@ -353,7 +202,7 @@ class Experiment:
             jax.vmap(lambda dt: self.model.process.noise.cov(forces, None, None, dt))(self.timeline.dt)
         )
         camera = self.model.sensors[0].params
-        R = camera.sigma**2 * np.eye(2) + np.asarray(_attitude_cov(camera, jnp.asarray(self.flight.attitude)))
+        R = camera.sigma**2 * np.eye(2) + np.asarray(attitude_cov(camera, jnp.asarray(self.flight.attitude)))
         information = np.swapaxes(H, 1, 2) @ np.linalg.inv(R) @ H * self.timeline.frame[:, None, None]
         # In units of the prior, where the numbers are of one size.
         L = np.asarray(self.flight.L)
@@ -405,26 +254,3 @@ def target_axes(velocity: np.ndarray, pole: np.ndarray) -> np.ndarray:
     T = np.cross(S, pole)
     T = T / np.linalg.norm(T)
     return np.stack([T, np.cross(S, T)])
-
-
-@jax.jit
-def _linearised(model: Model, flight: Flight, epochs: Epochs) -> tuple[Array, Array, Approach]:
-    forces = model.process.params
-
-    def body(x: Approach, dt: Array) -> tuple[Approach, tuple]:
-        F, _ = model.process.jacobian(forces, x, None, dt)  # type: ignore[misc]
-        x = model.process.step(forces, x, None, dt, jnp.zeros(6))
-        sight = Sight(look_at(-x.r), jnp.zeros(2), jnp.zeros((2, 2)))
-        H = jax.jacfwd(lambda d: body_pixel(model.sensors[0].params, approach.boxplus(x, d), sight))(jnp.zeros(14))
-        return x, (F, H, x)
-
-    return jax.lax.scan(body, flight.start, epochs.dt)[1]
-
-
-def linearised(model: Model, flight: Flight, epochs: Epochs) -> tuple[np.ndarray, np.ndarray, Any]:
-    """F (n, 14, 14), H (n, 2, 14) and the states along the orbit to the aim."""
-    F, H, x = _linearised(model, flight, epochs)
-    return np.asarray(F), np.asarray(H), x
-
-
-__all__ = ["Choice", "Epochs", "Experiment", "Flight", "estimate", "fly", "linearised", "target_axes"]

@@ -157,7 +157,8 @@ def _knowledge(spec: Any, est: dict) -> Claim:
         "Frames from 100 days on improve orbit and ephemeris; the ephemeris is about 1500 km off at first.",
         "Fig. 1",
         f"relative position, RMS at the hand-over: {_text(end)}",
-        f"body from the Sun: {_text(first)} after the first frame, {_text(ekf['ephemeris_error_km']['hand-over'])} at the hand-over",
+        f"body from the Sun: {_text(first)} after the first frame, "
+        f"{_text(ekf['ephemeris_error_km']['hand-over'])} at the hand-over",
         f"hand-over: {_text(ekf['bound_km']['hand-over'])}",
         "holds" if ok else "holds in part",
         "What frames show is the direction to the body: the relative orbit. The body's own orbit about the Sun becomes as good as "

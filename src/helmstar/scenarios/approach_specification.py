@@ -14,7 +14,8 @@ Finite = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 Positive = Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 Vector3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
-Sigmas3 = Annotated[list[Positive], Field(min_length=3, max_length=3)]
+Sigma = Annotated[float, Field(ge=1e-9, le=1e6, allow_inf_nan=False)]
+Sigmas3 = Annotated[list[Sigma], Field(min_length=3, max_length=3)]
 MOST_EPOCHS = 20_000
 
 

@@ -10,15 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
 from ..backend import jax, jnp
 from ..core import Gaussian, pytree
 from ..filters import ErrorStateKalmanFilter, MixtureFilter
 from ..models.approach import Approach
 from ..models.relative import Motion, PositionVelocityPointing, position_velocity_pointing, relative_model
 from .li2007 import Prior, estimate
-from .li2007_data import Setting, _simulate_run
+from .li2007_data import Setting, simulate
 
 Array = jax.Array
 SHORTEST_S = 0.1
@@ -69,7 +67,7 @@ def terminal_tracking(
         data.setting, r0=truth.r, v=truth.v, sigma_v=jnp.zeros(()), dt=dt, sigma_q=data.motion.sigma_q * jnp.sqrt(dt),
         offset=zero, sigma_0=zero,
     )  # fmt: skip
-    sim = replace(_simulate_run(setting, run), start=belief.mean.r)
+    data_of_run = replace(simulate(setting, run[None]), start=belief.mean.r[None])
     pointing = jnp.diag(data.prior.P0[3:6, 3:6])
     o = jnp.zeros((6, 3))
     P0 = jnp.block([[belief.cov[:6, :6], o], [o.T, jnp.diag(pointing)]])
@@ -77,20 +75,11 @@ def terminal_tracking(
     along = jnp.concatenate([direction, jnp.zeros(6)])
     prior = replace(data.prior, P0=P0, velocity=belief.mean.v, along=along)
     model = relative_model(replace(data.motion, velocity=belief.mean.v), setting.camera, PositionVelocityPointing)
-    many = jax.tree.map(lambda a: a[None], sim)
     static = {"filter": end.filter, "kind": end.kind, "n": end.n, "state": PositionVelocityPointing}
-    found = jax.tree.map(lambda a: a[0], estimate(model, prior, dt, many, **static))
+    found = jax.tree.map(lambda a: a[0], estimate(model, prior, dt, data_of_run, **static))
     return {
         "terminal_error_km": found["position_error_km"],
         "terminal_sigma_km": found["position_sigma_km"],
         "terminal_nees_per_state": found["nees_per_state"],
         "terminal_step_s": dt,
     }
-
-
-def li2007_prior() -> tuple[np.ndarray, float]:
-    """What li2007 starts from, 1 sigma: position (3,) km, velocity km/s."""
-    from .specification import load
-
-    p = load("li2007")[1].prior
-    return np.array(p.position_km), p.velocity_km_s
