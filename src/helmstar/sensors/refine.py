@@ -22,13 +22,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..attitude import quaternion_of_matrix
 from ..imaging import Camera, Centroids
 from ..imaging.calibrate import Calibration, derivative
 from ..imaging.calibrated import Calibrated
+from ..stars.glance import quaternion_of
 from ..stars.identify import Identification, matrix_of_quaternion
 from ..stars.patterns import Sky
-from ..stars.verify import turn
+from ..stars.verify import middle, turn
 
 EPOCH_SPREAD_YEARS = 25.0
 """Proper motion counts as this many years of uncertainty where the time of an image is not told."""
@@ -42,7 +42,10 @@ MAGNITUDE_GATE = 2.5
 """Difference of magnitudes beyond which a star and a detection do not match."""
 STILL_PX = 0.03
 """Steps that move no star farther are the last: what the linear problem leaves is of their second order."""
+BENT_PX = 0.01
+"""Bound on what the linear problem leaves, a third of it at most in truth, below which a step is the last as well."""
 _STEPS = 4
+_MATCHINGS = 2
 _LEAST = 3
 _ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])
 
@@ -109,35 +112,37 @@ def refine(
     camera: as the identification took it. epoch_years: 1 sigma of the time between the sky's year and the image. Where fewer
     than three stars match, the identification stays as it is.
     """
-    start = replace(camera, focal_px=found.focal_px)
     lens = _Lens.of(camera, prior)
     R, p = matrix_of_quaternion(found.q_SN), np.array([np.log(found.focal_px / camera.focal_px), 0.0, 0.0, 0.0])
-    near = _in_view(sky, R, start)
+    magnitude = -2.5 * np.log10(np.maximum(centroids.flux, 1e-12))
+    zero = middle(sky.magnitude[found.stars] - magnitude[found.detections])
+    near = _in_view(sky, R, camera, found.focal_px)
+    near = near[sky.magnitude[near] < zero + float(magnitude.max()) + MAGNITUDE_GATE]
     at = np.minimum(np.searchsorted(near, found.stars), len(near) - 1)
     good = near[at] == found.stars if len(near) else np.zeros(len(at), bool)
     i, j = at[good], found.detections[good]
     if len(i) < _LEAST:
-        return Refined(found, start, 1.0)
+        return Refined(found, replace(camera, focal_px=found.focal_px), 1.0)
     xy, C = centroids.xy_px, centroids.covariance_px
     drift = epoch_years * found.focal_px * np.hypot(sky.catalog.pm_ra[near], sky.catalog.pm_dec[near])
     spread = lambda i, j: C[j] + drift[i, None, None] ** 2 * lens.round  # noqa: E731
-    magnitude = -2.5 * np.log10(np.maximum(centroids.flux, 1e-12))
-    zero = np.median(sky.magnitude[found.stars] - magnitude[found.detections])
     agree = np.abs(sky.magnitude[near][:, None] - magnitude - zero) < MAGNITUDE_GATE
     d_N, best, residual = sky.directions[near], None, np.zeros((0, 2))
     for _ in range(_STEPS):
         predicted, J = lens.predict(R, p, d_N)
         best = None if best is None else replace(best, delta=np.zeros(7))
         best = _settle(J[i], xy[j] - predicted[i], spread(i, j), lens.prior(p), 2 if best is None else 1, best)
-        k, m = _matched(predicted + best.moved(J), J, best, xy, C, drift, agree)
-        same = len(k) == len(i) and bool((k == i).all() and (m == j).all())
-        if not same and len(k) >= max(_LEAST, len(i) // 2):
+        for _ in range(_MATCHINGS):
+            k, m = _matched(predicted + best.moved(J), J, best, xy, C, drift, agree)
+            same = len(k) == len(i) and bool((k == i).all() and (m == j).all())
+            if same or len(k) < max(_LEAST, len(i) // 2):
+                break
             i, j = k, m
             best = _settle(J[i], xy[j] - predicted[i], spread(i, j), lens.prior(p), 2, best)
         R, p = turn(best.delta[:3], R), p + best.delta[3:]
         moved = best.moved(J[i])
         residual = xy[j] - predicted[i] - moved
-        if float(np.abs(moved).max()) < STILL_PX:
+        if lens.second_order(best.delta) < BENT_PX or float(np.abs(moved).max()) < STILL_PX:
             break
     assert best is not None
     order = np.argsort(j, kind="stable")
@@ -149,11 +154,11 @@ def refine(
         )
     except ValueError:  # a distortion that folds the corners over, where no star was seen
         fitted = replace(camera, focal_px=focal)
-    q_SN, z = quaternion_of_matrix(R), R[2]
+    q_SN, z = quaternion_of(R), R[2]
     mounted = found.q_BN is not found.q_SN
     R_BS = matrix_of_quaternion(found.q_BN) @ matrix_of_quaternion(found.q_SN).T if mounted else None
     better = replace(
-        found, q_SN=q_SN, q_BN=q_SN if R_BS is None else quaternion_of_matrix(R_BS @ R),
+        found, q_SN=q_SN, q_BN=q_SN if R_BS is None else quaternion_of(R_BS @ R),
         covariance=best.covariance[:3, :3], stars=near[i], detections=j, hip=sky.catalog.hip[near[i]],
         residuals_px=residual * [1.0, camera.aspect], focal_px=focal,
         residual_rms=float(np.sqrt(np.mean((residual * [1.0, camera.aspect]) ** 2)) / focal),
@@ -163,13 +168,15 @@ def refine(
     return Refined(better, fitted, best.scale)
 
 
-def _in_view(sky: Sky, R: np.ndarray, camera: Camera) -> np.ndarray:
+def _in_view(sky: Sky, R: np.ndarray, camera: Camera, focal_px: float) -> np.ndarray:
     """Indices of the stars that a pinhole at R sees on the image and a margin of 4% around it."""
-    half = np.array([camera.width, camera.height * camera.aspect]) * (0.54 / camera.focal_px)
-    near = np.flatnonzero(sky.directions @ R[2] > np.cos(np.arctan(np.hypot(*half))))
+    half_x, half_y = 0.54 * camera.width / focal_px, 0.54 * camera.height * camera.aspect / focal_px
+    near = sky.around(R[2], float(np.arctan(np.hypot(half_x, half_y))))
     v = sky.directions[near] @ R.T
-    offset = (np.array([camera.width - 1, camera.height - 1]) / 2 - [camera.cx, camera.cy]) * [1.0, camera.aspect]
-    return near[(np.abs(v[:, :2] - v[:, 2:] * offset / camera.focal_px) < half * v[:, 2:]).all(axis=1)]
+    off_x = (0.5 * (camera.width - 1) - camera.cx) / focal_px
+    off_y = (0.5 * (camera.height - 1) - camera.cy) * camera.aspect / focal_px
+    z = v[:, 2]
+    return near[(np.abs(v[:, 0] - off_x * z) < half_x * z) & (np.abs(v[:, 1] - off_y * z) < half_y * z)]
 
 
 @dataclass(frozen=True)
@@ -223,6 +230,12 @@ class _Lens:
         J[:, :, :3] = (J[:, :, :3].reshape(-1, 3) @ T).reshape(-1, 2, 3)
         J[:, 0, 6], J[:, 1, 6] = f * x * r2, f / a * y * r2
         return np.stack([c.cx + ex + f * xd, c.cy + ey + f / a * yd], axis=1), J
+
+    def second_order(self, delta: np.ndarray) -> float:
+        """Bound, px, on what a step (7,) leaves: products of turns, of the focal length's and of the centre's share."""
+        f = self.camera.focal_px
+        turned, centre = float(np.abs(delta[:3]).sum()), float(np.abs(delta[4:6]).sum())
+        return f * (turned + abs(float(delta[3])) + centre / f) ** 2
 
     def prior(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Information (7,) of what is known before, and its gradient (7,) at p."""

@@ -23,6 +23,7 @@ from ..imaging import Camera, Centroids, DetectionSettings, Image
 from ..imaging.calibrated import Calibrated
 from ..imaging.detect import Optics, detect_near, detect_next
 from ..stars.catalog import Catalog, load_catalog
+from ..stars.glance import follow, glance
 from ..stars.identify import LIMIT, Identification, identify, identify_stated, matrix_of_quaternion, unit_quaternion
 from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
@@ -170,7 +171,7 @@ class StarTracker:
             return None
         R = matrix_of_quaternion(q)
         radius = 0.5 * math.hypot(camera.width, camera.height * camera.aspect) / camera.focal_px
-        near = np.flatnonzero(self.sky.directions @ R[2] > math.cos(math.atan(radius)))  # the brightest first
+        near = self.sky.around(R[2], math.atan(radius))
         xy = camera.pixels(self.sky.directions[near[: 2 * TRACKED]] @ R.T)
         xy = xy[camera.inside(xy)][:TRACKED]
         return detect_near(image, xy, reach, last.optics, self.detection, dark) if len(xy) >= 4 else None
@@ -189,9 +190,20 @@ class StarTracker:
             focal_px=camera.focal_px, centre_px=(camera.cx + 0.5, camera.cy + 0.5), aspect=camera.aspect,
             distortion=camera.distortion, size_px=(camera.width, camera.height),
         )  # fmt: skip
-        if prior_q_SN is not None and prior_sigma is not None and fov_range is None:
+        prior = (
+            None if prior_q_SN is None or prior_sigma is None or fov_range is not None else (prior_q_SN, prior_sigma)
+        )
+        seen = (centroids.xy_px + 0.5, centroids.flux, centroids.covariance_px, eye, self.sky, focal_sigma, self.limit)
+        found = None
+        if prior is not None:
+            found = follow(*seen, *prior, self.q_SB)
+        elif fov_range is None:
+            found = glance(*seen, self.q_SB)
+        if found is not None:
+            pass
+        elif prior is not None:
             found = track(
-                centroids.xy_px + 0.5, eye, prior_q_SN, prior_sigma, flux=centroids.flux,
+                centroids.xy_px + 0.5, eye, *prior, flux=centroids.flux,
                 sigma_px=centroids.covariance_px, focal_sigma=focal_sigma, q_SB=self.q_SB, sky=self.sky, limit=self.limit,
                 fall_back=fall_back,
             )  # fmt: skip
@@ -211,10 +223,10 @@ class StarTracker:
         scale = 1.0
         if found.solved:
             if self.known is not None:
-                prior = LensPrior.calibrated(self.known)
+                lens = LensPrior.calibrated(self.known)
             else:
-                prior = LensPrior.uncalibrated(camera, math.inf if fov_range is not None else focal_sigma)
-            refined = refine(found, centroids, camera, self.sky, prior, self.epoch_years)
+                lens = LensPrior.uncalibrated(camera, math.inf if fov_range is not None else focal_sigma)
+            refined = refine(found, centroids, camera, self.sky, lens, self.epoch_years)
             found, camera, scale = refined.identification, refined.camera, refined.scale
         end = time.perf_counter()
         ms = {**(ms or {}), "identify": 1e3 * (done - begin), "refine": 1e3 * (end - done)}
@@ -284,11 +296,35 @@ def _solution(
 def centre_angles(camera: Camera, R_SN: np.ndarray) -> tuple[float, float, float]:
     """Right ascension, declination and roll in deg of the image's geometric centre: roll is north's direction there, from
     image up (-y), counter-clockwise as seen in the image."""
-    centre = np.array(camera.geometric_centre_px)
-    z = camera.directions(centre) @ R_SN
-    # A step north on the sky, back in the image. At a pole north is everywhere; the limit along the step is taken.
+    x, y = _centre_of(camera)
+    z = np.array([x, y, 1.0]) @ R_SN / math.sqrt(x * x + y * y + 1.0)
+    # A step north on the sky, seen in the image through the derivative of x/z, y/z and of the distortion. At a pole north is
+    # everywhere; the limit along the step is taken.
     north = np.array([0.0, 0.0, 1.0]) - z[2] * z
-    step = z + 1e-6 * north / max(float(np.linalg.norm(north)), 1e-12)
-    dx, dy = (camera.pixels(R_SN @ step) - centre) * np.array([1.0, camera.aspect])
+    v = (R_SN @ north).tolist()
+    px, py = v[0] - x * v[2], v[1] - y * v[2]
+    _, _, xx, xy, yx, yy = _distorted(camera, x, y)
+    dx, dy = xx * px + xy * py, yx * px + yy * py
     roll = math.degrees(math.atan2(-dx, -dy)) % 360.0
     return math.degrees(math.atan2(z[1], z[0])) % 360.0, math.degrees(math.asin(max(-1.0, min(1.0, z[2])))), roll
+
+
+def _centre_of(camera: Camera) -> tuple[float, float]:
+    """X/Z and Y/Z of the direction seen at the image's geometric centre, in plain numbers."""
+    u, v = camera.geometric_centre_px
+    xd, yd = (u - camera.cx) / camera.focal_px, (v - camera.cy) * camera.aspect / camera.focal_px
+    x, y = xd, yd
+    if any(camera.distortion):
+        for _ in range(12):
+            fx, fy, a, b, c, d = _distorted(camera, x, y)
+            ex, ey, det = fx - xd, fy - yd, a * d - b * c
+            dx, dy = (d * ex - b * ey) / det, (a * ey - c * ex) / det
+            x, y = x - dx, y - dy
+            if abs(dx) + abs(dy) <= 1e-15:
+                break
+    return x, y
+
+
+def _distorted(camera: Camera, x: float, y: float) -> tuple[float, ...]:
+    """As the camera does it for arrays: x', y', and dx'/dx, dx'/dy, dy'/dx, dy'/dy."""
+    return camera._distort(x, y)  # pyright: ignore[reportArgumentType, reportReturnType]

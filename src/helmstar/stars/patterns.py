@@ -8,6 +8,7 @@ string switches it off), with a version and a checksum; a file that is stale or 
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 import zlib
@@ -236,6 +237,7 @@ class Sky:
         self.magnitude = catalog.magnitude
         self._shared = _shared_tables(catalog)
         self._deep: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._whole: tuple[np.ndarray, np.ndarray] | None = None
 
     def level(self, i: int) -> Level:
         """Tables of LADDER[i]."""
@@ -244,15 +246,29 @@ class Sky:
     def near(self, i: int, centre: np.ndarray, radius: float) -> np.ndarray:
         """Catalogue indices, brightest first, of level i's deep stars within `radius` (rad) of a direction (3,)."""
         if i not in self._deep:
-            members = self.level(i).members(DEEP)
-            members = members[np.argsort(self.directions[members, 2], kind="stable")]
-            self._deep[i] = members, np.ascontiguousarray(self.directions[members])
-        # Of a band of declinations; importing scipy's trees would take the first solution 0.5 s.
-        members, directions = self._deep[i]
-        dec = float(np.arcsin(np.clip(centre[2], -1.0, 1.0)))
-        low, high = np.sin(np.clip([dec - radius, dec + radius], -0.5 * np.pi, 0.5 * np.pi))
-        begin, end = np.searchsorted(directions[:, 2], [low - 1e-12, high + 1e-12])
-        return np.sort(members[begin:end][directions[begin:end] @ centre > np.cos(radius)])
+            self._deep[i] = self._banded(self.level(i).members(DEEP))
+        return _in_circle(*self._deep[i], centre, radius)
+
+    def around(self, centre: np.ndarray, radius: float) -> np.ndarray:
+        """Indices, brightest first, of all the catalogue's stars within `radius` (rad) of a direction (3,)."""
+        if self._whole is None:
+            self._whole = self._banded(np.arange(len(self.directions)))
+        return _in_circle(*self._whole, centre, radius)
+
+    def _banded(self, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Members by declination, and their directions. Importing scipy's trees would take the first solution 0.5 s."""
+        members = members[np.argsort(self.directions[members, 2], kind="stable")]
+        return members, np.ascontiguousarray(self.directions[members])
+
+
+def _in_circle(members: np.ndarray, directions: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
+    """Those of the members, sorted by declination as their directions, within `radius` (rad) of a direction, ascending."""
+    dec = math.asin(max(-1.0, min(1.0, float(centre[2]))))
+    low, high = (math.sin(max(-0.5 * math.pi, min(0.5 * math.pi, dec + r))) for r in (-radius, radius))
+    begin, end = directions[:, 2].searchsorted([low - 1e-12, high + 1e-12])
+    found = members[begin:end][directions[begin:end] @ centre > math.cos(radius)]
+    found.sort()
+    return found
 
 
 def aberrated(directions: np.ndarray, velocity_c: np.ndarray | None) -> np.ndarray:
