@@ -142,7 +142,7 @@ def test_light_and_dark_of_a_convex_mesh_need_no_shadow_map():
 
 def test_stars_behind_are_hidden():
     r = np.array([0.0, 0.0, distance(100.0)])
-    at = CAMERA.centre_px
+    at = np.array(CAMERA.geometric_centre_px)
     place = np.array([at, [at[0] + 45.0, at[1]], [at[0] + 60.0, at[1]], [10.0, 10.0], [900.0, 10.0]])
     stars = Stars(CAMERA.directions(place), np.full(5, 1e5))
     quiet = Exposure(poisson=False, read_noise_e=0.0, sky_e_s=0.0, dark_e_s=0.0, full_well_e=1e9, bits=16)

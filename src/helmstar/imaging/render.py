@@ -111,7 +111,7 @@ def render(
     electrons = e.zero_point_e_s * e.duration * 10.0 ** (-0.4 * magnitude[seen])
     light = _background(camera, e)
     _add_stars(light, camera, d_S[seen], electrons, e)
-    image = _sensor(light, e, np.random.default_rng(seed))
+    image = sensor_counts(light, e, np.random.default_rng(seed))
     on = camera.inside(place[seen])
     return image, Truth(seen[on], place[seen][on, 0], place[seen][on, 1], electrons[on])
 
@@ -200,8 +200,12 @@ def _add_stars(light: np.ndarray, camera: Camera, d_S: np.ndarray, electrons: np
         np.add.at(light.reshape(-1), (rows * camera.width + columns)[on], window[on].astype(np.float32))
 
 
-def _sensor(light: np.ndarray, e: Exposure, rng: np.random.Generator) -> Image:
-    """From mean electrons to counts."""
+def sensor_counts(light: np.ndarray, e: Exposure, rng: np.random.Generator) -> Image:
+    """A frame from the mean electrons of its pixels: hot pixels, shot noise, full well, read noise, gain, offset, whole counts.
+
+    light: (height, width) float32, electrons, at least 0; hot pixels are added to it in place. rng: in this order hot pixels, shot
+    noise, read noise. The frame's saturation is the well's or the converter's, in counts, whichever is lower.
+    """
     hot = round(e.hot_fraction * light.size)
     if hot:
         at = rng.choice(light.size, hot, replace=False)
@@ -217,4 +221,4 @@ def _sensor(light: np.ndarray, e: Exposure, rng: np.random.Generator) -> Image:
     return Image(counts.astype(kind), saturation, e.bits, {"format": "rendered"})
 
 
-__all__ = ["Exposure", "Glow", "Truth", "longest_smear", "pointed", "render", "turned"]
+__all__ = ["Exposure", "Glow", "Truth", "longest_smear", "pointed", "render", "sensor_counts", "turned"]

@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.fft import next_fast_len
 from scipy.ndimage import correlate1d, uniform_filter
 
 from ..camera import Camera
@@ -285,6 +285,11 @@ def coarse_fit(data: Data, scene: Scene, start: Trial, detector: Detector) -> Fi
     )
 
 
+def _correlation(a: np.ndarray, b: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Sums of a times b shifted, over all shifts modulo `shape`."""
+    return np.fft.irfft2(np.fft.rfft2(a, shape) * np.conj(np.fft.rfft2(b, shape)), shape)
+
+
 def place(data: Data, scene: Scene, around: np.ndarray | None, reach_px: float) -> tuple[np.ndarray, float] | None:
     """Where a template of the expected size explains most light, (2,) px of the data's frame, and the next best place's share of
     that; None where no pixel is bright. around: (2,) centre of the search, within reach_px; None searches all."""
@@ -295,10 +300,9 @@ def place(data: Data, scene: Scene, around: np.ndarray | None, reach_px: float) 
     left, top, width, height = scene.window(trial)
     T = scene.draw(trial, (left, top, width, height), law=law, with_family=False)[0]
     I = np.where(data.good, data.grey, 0.0)
-    shape = tuple(next_fast_len(a + b) for a, b in zip(I.shape, T.shape))
-    F = rfft2(T, shape)
-    light = irfft2(rfft2(I, shape) * np.conj(F), shape)
-    power = irfft2(rfft2(data.good.astype(float), shape) * np.conj(rfft2(T * T, shape)), shape)
+    shape = tuple(int(next_fast_len(a + b) or a + b) for a, b in zip(I.shape, T.shape))
+    light = _correlation(I, T, shape)
+    power = _correlation(data.good.astype(float), T * T, shape)
     whole = float((T * T).sum())
     if whole <= 0.0:
         return None

@@ -16,7 +16,7 @@ from scipy.special import erf
 
 from ..camera import Camera
 from ..frame import Image
-from ..render import Exposure, _sensor
+from ..render import Exposure, sensor_counts
 from .phase import nodes
 from .photometry import Lambert, Law
 from .raycast import Grid, average
@@ -91,7 +91,7 @@ def render_window(
         truth = _with_stars(light, camera, shape, r, R, stars, window, e, truth)
     light += (e.sky_e_s + e.dark_e_s) * e.duration
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
-    return _sensor(np.maximum(light, 0.0).astype(np.float32), e, rng), truth
+    return sensor_counts(np.maximum(light, 0.0).astype(np.float32), e, rng), truth
 
 
 def checked(shape: Shape, r_TC_C: Any, sun_C: Any, R_TC: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

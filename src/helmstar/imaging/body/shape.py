@@ -163,7 +163,7 @@ class EllipsoidView:
         root = np.sqrt(np.maximum(1.0 - pp, 0.0))
         back = root / np.sqrt(uu)
         q = [p_ - back * u_ for p_, u_ in zip(p, u)]
-        if isinstance(self.across, float):
+        if not isinstance(self.across, np.ndarray):
             size: np.ndarray | float = self.across
         else:
             normal = [a * q[0] + b * q[1] + c * q[2] for a, b, c in self.across]

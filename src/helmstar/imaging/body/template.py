@@ -139,7 +139,7 @@ class Data:
         h, w = (self.grey.shape[0] - y0) // n, (self.grey.shape[1] - x0) // n
         part = (slice(y0, y0 + h * n), slice(x0, x0 + w * n))
         grey = self.grey[part].reshape(h, n, w, n).mean(axis=(1, 3))
-        good = self.good[part].reshape(h, n, w, n).all(axis=(1, 3))
+        good = np.asarray(self.good[part].reshape(h, n, w, n).all(axis=(1, 3)))
         return Data(grey, good, self.noise / n, ((self.corner[0] + x0) / n, (self.corner[1] + y0) / n))
 
 
