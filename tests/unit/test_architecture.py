@@ -17,7 +17,7 @@ FLOORS = {
     "sensors": 3, "io": 3,
     "scenarios": 4, "telemetry": 4, "startracker": 4, "opnav": 4,
     "campaign": 5, "report": 5,
-    "cli": 6, "__main__": 7, "__init__": -3,
+    "parser": 5, "cli": 6, "__main__": 7, "__init__": -3,
 }  # fmt: skip
 # Rooms of one floor that may look at each other, in the direction given; report.claims is the one thing that scenarios
 # and telemetry build for the floor above them, inside the functions that make or write a report.

@@ -12,7 +12,8 @@ import time
 
 import pytest
 
-from helmstar.cli import main, parser
+from helmstar.cli import COMMANDS, main
+from helmstar.parser import parser
 
 SMALL = ["--runs", "3", "--set", "updates=20", "--set", "width=4", "--estimators", "lie,mekf_tuned"]
 
@@ -133,7 +134,7 @@ def test_the_recorded_command_reproduces_from_nothing(capsys, tmp_path):
         assert "--re" not in json.loads((tmp_path / "campaign.json").read_text())["command"]
 
 
-@pytest.mark.parametrize("command", ["run", "scenarios", "attitude", "allan"])
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_with_an_example(capsys, command):
     with pytest.raises(SystemExit) as e:
         main([command, "--help"])
