@@ -82,7 +82,8 @@ def find_peaks(array: np.ndarray, level: int, threshold: float, quantum: float) 
     lower, rows = mesh.least(threshold)
     if out == np.uint16:  # one type on both sides is compared many pixels at a time
         lower = np.clip(np.floor(lower), 0, np.iinfo(np.uint16).max).astype(np.uint16)
-    high = np.zeros((h - 2, w), bool)
+    high = np.empty((h - 2, w), bool)
+    high[:, 0], high[:, w - 3 :], high[0], high[h - 3] = False, False, False, False
     for k in range(len(lower)):
         band = slice(max(int(rows[k]), 1), min(int(rows[k + 1]), h - 3))
         np.greater(f[band, 1 : w - 3], lower[k, 1:-1], out=high[band, 1 : w - 3])
