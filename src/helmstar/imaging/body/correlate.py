@@ -39,19 +39,20 @@ from .target import (
 )
 from .template import Data, Scene, Trial, data_of
 
-COARSE_PX = 24.0
-"""Diameter to which a large body is binned for the first fit."""
+COARSE_PX, COARSE_PSF = 32.0, 0.6
+"""Diameter to which a large body is binned for the first fit, and sigma to which it is smoothed, in those pixels."""
 FLOOR_PX, LAW_FLOOR_PX, LAW_FLOOR = 0.002, 0.006, 3e-5
 """1 sigma of what templates leave: of rendering, px, and of laws that the family comes near, px and per px of diameter."""
 HOPELESS, EXPLAINED = 10.0, 0.8
 """Squares per degree of freedom from which a fit that does not settle, or that explains less of the light's squares, is none."""
-STILL = 0.02
-"""A step that lowers the sum of squares by less, in units of the noise, is the last."""
+STILL, LINEAR = 0.02, 0.06
+"""A step is the last that lowers the sum of squares by less, in units of the noise, or that moves edges by less, in sigma of the
+optics: what the second order would add to it is a few per cent of it. It is taken without another template."""
 LAW_FREEDOM = 0.5
 """Prior sigma of each pattern of the family, over the flux of the law."""
 _STEPS = (np.diag([1.0, -1.0, 0.0]), np.array([[0, 1.0, 0], [1, 0, 0], [0, 0, 0]]), np.array([[0, 0, 1.0], [0, 0, 0], [1, 0, 0]]),
           np.array([[0, 0, 0], [0, 0, 1.0], [0, 1, 0]]), np.diag([-0.5, -0.5, 1.0]))  # fmt: skip
-_FINITE = 0.01
+_FINITE, _FINITE_PX = 0.01, 0.1  # of a stretch, and what it may move edges by
 # Of sixth order: the optics leave little light in what these get wrong, and much in what simple differences do.
 _SLOPE = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0]) / 60.0
 _BEND = np.array([2.0, -27.0, 270.0, -490.0, 270.0, -27.0, 2.0]) / 180.0
@@ -105,6 +106,8 @@ class _Problem:
         stretches = [] if not self.free else [0.0] * 5 if start.stretch is None else list(_components(start.stretch))
         self.scales: np.ndarray | None = None
         self.level: float | None = None
+        self.drawn: tuple[np.ndarray, list[np.ndarray]] | None = None
+        self.radius_px = 0.5 * scene.diameter_px()
         self.start = np.array([*start.centre_px, math.log(start.size), 0.0, *stretches])
 
     def trial(self, p: np.ndarray) -> Trial:
@@ -117,7 +120,10 @@ class _Problem:
     def solve(self, p: np.ndarray) -> _State:
         """The best linear unknowns at a geometry, and the cost."""
         height, width = self.at[3], self.at[2]
-        images = self._scene(p).draw(self.trial(p), self.wide, law=self.law, with_family=self.with_family)
+        if self.drawn is None or not np.array_equal(self.drawn[0], p):
+            here = self._scene(p)
+            self.drawn = p, here.draw(self.trial(p), self.wide, law=self.law, with_family=self.with_family)
+        images = self.drawn[1]
         if self.scales is None:  # of equal flux at the start; if they changed by geometry, so would the prior
             size = max(float(images[0].sum()), 1e-12)
             self.scales = np.array([size / max(float(i.sum()), 1e-12) for i in images])
@@ -162,8 +168,15 @@ class _Problem:
                 self.trial(p), self.at, law=self.law, with_family=self.with_family, weights=weights
             )[0]
             base = draw(p)
-            columns += [(draw(p + _FINITE * e) - base) / _FINITE for e in np.eye(len(p))[4:]]
+            h = min(_FINITE, _FINITE_PX / self.radius_px)
+            columns += [(draw(p + h * e) - base) / h for e in np.eye(len(p))[4:]]
         return np.stack([c.ravel() for c in columns], axis=1) * self.ok[:, None]
+
+    def small(self, move: np.ndarray) -> bool:
+        """Whether the image is linear over a step of the geometry."""
+        limit = LINEAR * self.scene.psf_sigma_px
+        edges = [float(np.hypot(*move[:2])), self.radius_px * float(np.abs(move[[2, *range(4, len(move))]]).max())]
+        return max(edges) < limit and abs(float(move[3])) < 3.0 * LINEAR
 
 
 @dataclass(frozen=True)
@@ -184,12 +197,11 @@ class _State:
 
 def fit(
     data: Data, scene: Scene, start: Trial, detector: Detector, *, iterations: int = 50, freedom: float = LAW_FREEDOM,
-    margin_px: float = 2.0, still_px: float = 1e-3,
+    margin_px: float = 2.0,
 ) -> Fit:  # fmt: skip
     """Levenberg and Marquardt's least squares from a start, which should lie within about half of the body's radius.
 
     freedom: prior sigma of the family's patterns. margin_px: by how much the window is wider than the body at the start.
-    still_px: a shorter step is the last.
     """
     problem = _Problem(data, scene, start, detector, freedom, margin_px)
     state = problem.solve(problem.start)
@@ -197,11 +209,13 @@ def fit(
     if not weighed:
         problem.weigh(state)
         state = problem.solve(problem.start)
-    damping, converged, fresh = 1e-3, False, True
-    A, J, g = np.eye(1), np.zeros((1, 1)), np.zeros(1)
+    damping, fresh = 1e-3, True
+    A, J, g, inner, cross = np.eye(1), np.zeros((1, 1)), np.zeros(1), np.eye(1), np.zeros((1, 1))
+    newton, gain = np.zeros(len(problem.start)), math.inf
     diameter = scene.diameter_px()
     most = np.array([0.25 * diameter + 0.5] * 2 + [0.2, 0.5] + [0.1] * problem.free)
     for _ in range(iterations):
+        unit = max(1.0, state.cost / max(float(problem.ok.sum()), 1.0))
         if fresh:
             J = problem.jacobian(state)
             Jw = J * problem.w[:, None]
@@ -210,28 +224,36 @@ def fit(
             inner = np.linalg.inv(state.Dw.T @ state.D + np.diag(state.prior + 1e-15))
             A = Jw.T @ J + np.diag(problem.prior) - cross @ inner @ cross.T
             g = Jw.T @ state.rest - problem.prior * state.p
+            newton = np.linalg.solve(A + np.diag(1e-12 * np.diagonal(A) + 1e-15), g)
+            gain = float(g @ newton)
             fresh = False
-        move = np.linalg.solve(A + np.diag(damping * np.diagonal(A) + 1e-12), g)
-        move /= max(1.0, float(np.max(np.abs(move) / most)))
-        p = state.p + move
-        p[2:4] = np.clip(p[2:4], -1.5, 1.5)
-        p[4:] = np.clip(p[4:], -0.6, 0.6)
-        tried = problem.solve(p)
-        unit = max(1.0, state.cost / max(float(problem.ok.sum()), 1.0))
-        less = (state.cost - tried.cost) / unit
-        if less >= 0.0:
-            state, fresh, damping = tried, True, max(damping / 10.0, 1e-7)
-        else:
-            damping = max(10.0 * damping, 1e-2)
+        settled = gain < STILL * unit or problem.small(newton)
+        if not settled and damping <= 1e3:
+            move = np.linalg.solve(A + np.diag(damping * np.diagonal(A) + 1e-12), g)
+            move /= max(1.0, float(np.max(np.abs(move) / most)))
+            p = state.p + move
+            p[2:4] = np.clip(p[2:4], -1.5, 1.5)
+            p[4:] = np.clip(p[4:], -0.6, 0.6)
+            tried = problem.solve(p)
+            if tried.cost <= state.cost:
+                state, fresh, damping = tried, True, max(damping / 10.0, 1e-7)
+            else:
+                damping = max(10.0 * damping, 1e-2)
+            continue
         # What a step of Newton's length would gain is below what noise leaves, or steps that small gain nothing.
-        still = float(np.hypot(*move[:2])) < still_px and abs(float(move[2])) < 0.02 * problem.sigma_size + 1e-5
-        if abs(less) < STILL or still or damping > 1e3:
-            if weighed:
-                converged = damping <= 1e3 or float(g @ np.linalg.solve(A, g)) < 9.0 * unit
-                break
+        if not weighed:
             problem.weigh(state)
             state, weighed, fresh, damping = problem.solve(state.p), True, True, 1e-3
-    return _outcome(problem, state, J if not fresh else problem.jacobian(state), converged)
+            continue
+        if settled:
+            state = _moved(state, newton, J, -inner @ cross.T @ newton)
+        return _outcome(problem, state, J, settled or gain < 9.0 * unit)
+    return _outcome(problem, state, J if not fresh else problem.jacobian(state), gain < 9.0)
+
+
+def _moved(s: _State, move: np.ndarray, J: np.ndarray, follow: np.ndarray) -> _State:
+    """A state after a step over which it is linear; `follow` is that of the linear unknowns."""
+    return replace(s, p=s.p + move, found=s.found + follow, rest=s.rest - J @ move - s.D @ follow)
 
 
 def _outcome(problem: _Problem, s: _State, J: np.ndarray, converged: bool) -> Fit:
@@ -270,19 +292,28 @@ def _positive(M: np.ndarray) -> np.ndarray:
     return (vector * np.maximum(value, 0.0)) @ vector.T * np.outer(d, d)
 
 
-def coarse_fit(data: Data, scene: Scene, start: Trial, detector: Detector) -> Fit:
-    """A fit of a binned frame: patterns stay near the law, and how noisy light is comes from the residuals."""
-    size = 0.5 * scene.diameter_px() * min(3.0 * scene.pose.scale_sigma(scene.target), 0.6)
-    return fit(
-        data,
-        scene,
-        start,
-        replace(detector, gain_e=None),
-        freedom=0.2,
-        margin_px=3.0 + size,
-        iterations=15,
-        still_px=0.01,
+def coarse(data: Data, scene: Scene, start: Trial, detector: Detector, search_px: float | None) -> Trial:
+    """A place right within hundredths of a pixel, from a frame smoothed and binned to a body of COARSE_PX. search_px: how far
+    around the start to look for the body first; None where the start is near it."""
+    n = max(1, round(scene.diameter_px() / COARSE_PX))
+    blur = math.sqrt(max((COARSE_PSF * n) ** 2 - scene.psf_sigma_px**2, 0.0)) if n > 1 else 0.0
+    small, wide = (
+        data.smoothed(blur).binned(n),
+        replace(scene, psf_sigma_px=math.hypot(scene.psf_sigma_px, blur)).binned(n),
     )
+    there = Trial((start.centre_px - (n - 1) / 2) / n, start.size, start.stretch)
+    if search_px is not None:
+        found = place(small, wide, there.centre_px, search_px / n + 3.0)
+        there = there if found is None else Trial(found[0])
+    if n > 1:
+        # Of a width of which smoothing is most, less is unknown; light's noise is less by the pixels put together.
+        spread = detector.psf_spread * (scene.psf_sigma_px / n / wide.psf_sigma_px) ** 2
+        gain = None if detector.gain_e is None else detector.gain_e * n * n
+        margin = 2.0 + 0.5 * wide.diameter_px() * min(3.0 * scene.pose.scale_sigma(scene.target), 0.6)
+        there = fit(
+            small, wide, there, replace(detector, gain_e=gain, psf_spread=max(spread, 1e-3)), margin_px=margin
+        ).trial
+    return Trial(there.centre_px * n + (n - 1) / 2, there.size, there.stretch)
 
 
 def _correlation(a: np.ndarray, b: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -348,22 +379,13 @@ def centre_from_fit(
             DARK, "fit", "the side that faces the camera is not lit: is the Sun's direction right?", diameter
         )
     start = Trial(centroid.xy_px - offset)
-    n = max(1, round(diameter / COARSE_PX))
-    if centroid.status == FOUND and float(np.trace(unsure)) < 1.0:
-        n = 1  # the moment is a start good enough
-    if n > 1 or centroid.status in (CUT, SATURATED):
-        coarse, small = data.binned(n), scene.binned(n)
-        to = lambda xy: (xy - (n - 1) / 2) / n  # noqa: E731
-        there = Trial(to(start.centre_px))
-        if centroid.status in (CUT, SATURATED):
-            found = place(coarse, small, there.centre_px, diameter / n + 3.0)
-            if found is not None:
-                there = Trial(found[0])
-        if n > 1:
-            there = coarse_fit(coarse, small, there, detector).trial
-        start = Trial(there.centre_px * n + (n - 1) / 2, there.size, there.stretch)
-    # Templates on large pixels are right within a few hundredths of these; a body that was not binned may be of any size.
-    margin = 2.0 + (0.03 * diameter if n > 1 else min(diameter * pose.scale_sigma(target), 0.25 * diameter))
+    partial = centroid.status in (CUT, SATURATED)
+    # A moment right within the optics' width is a start good enough, unless the figure is free.
+    near = centroid.status == FOUND and float(np.trace(unsure)) < 0.1 and target.shape_sigma == 0.0
+    large = diameter > 1.5 * COARSE_PX and not near
+    if large or partial:
+        start = coarse(data, scene, start, detector, diameter if partial else None)
+    margin = 2.0 + (0.0 if large else min(diameter * pose.scale_sigma(target), 0.25 * diameter))
     result = fit(data, scene, start, detector, margin_px=margin)
     xy, C = result.trial.centre_px, result.covariance[:2, :2]
     C = C + np.eye(2) * (FLOOR_PX**2 + (0.0 if target.law_known else LAW_FLOOR_PX**2 + (LAW_FLOOR * diameter) ** 2))
@@ -389,4 +411,4 @@ def centre_from_fit(
     )  # fmt: skip
 
 
-__all__ = ["COARSE_PX", "LAW_FREEDOM", "Fit", "centre_from_fit", "fit", "place"]
+__all__ = ["COARSE_PX", "LAW_FREEDOM", "Fit", "centre_from_fit", "coarse", "fit", "place"]

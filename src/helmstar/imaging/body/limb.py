@@ -166,7 +166,10 @@ def centre_from_limb(
         )
     g = preprocess(image)
     data = data_of(image, g.grey, g.noise, corner)
-    trial = _coarse(data, scene, Trial(centroid.xy_px - offset), detector, centroid.status in (CUT, SATURATED))
+    from .correlate import coarse
+
+    search = diameter if centroid.status in (CUT, SATURATED) else None
+    trial = coarse(data, scene, Trial(centroid.xy_px - offset), detector, search)
     C, chi2, points = np.full((2, 2), np.nan), float("nan"), np.zeros((0, 2))
     size_sigma = float("nan")
     for reach in (0.03 * diameter + 3.0, 2.5):
@@ -183,20 +186,6 @@ def centre_from_limb(
         status, "limb", trial.centre_px, C + FLOOR_PX**2 * np.eye(2), centroid.xy_px, diameter, trial.size, size_sigma,
         points, chi2, message,
     )  # fmt: skip
-
-
-def _coarse(data: Data, scene: Scene, start: Trial, detector: Detector, search: bool) -> Trial:
-    """A place right within a few per cent of the radius, from templates on large pixels."""
-    from .correlate import COARSE_PX, coarse_fit, place
-
-    n = max(1, round(scene.diameter_px() / COARSE_PX))
-    coarse, small = data.binned(n), scene.binned(n)
-    there = Trial((start.centre_px - (n - 1) / 2) / n)
-    if search:
-        found = place(coarse, small, there.centre_px, small.diameter_px() + 3.0)
-        there = there if found is None else Trial(found[0])
-    first = coarse_fit(coarse, small, there, detector).trial
-    return Trial(first.centre_px * n + (n - 1) / 2, first.size, first.stretch)
 
 
 _STRETCH = (np.diag([1.0, -1.0, 0.0]), np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 0]]))

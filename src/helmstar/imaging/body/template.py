@@ -131,6 +131,14 @@ class Data:
         at = (x0 + int(self.corner[0]), y0 + int(self.corner[1]), x1 - x0, y1 - y0)
         return self.grey[y0:y1, x0:x1], self.good[y0:y1, x0:x1], at
 
+    def smoothed(self, sigma_px: float) -> Data:
+        """After a Gaussian of that sigma; what it takes from pixels that are bad or beyond the edge is bad."""
+        if sigma_px <= 0.0:
+            return self
+        here = gaussian_filter(self.good.astype(np.float32), sigma_px, mode="constant", truncate=3.0)
+        grey = gaussian_filter(np.where(self.good, self.grey, 0.0), sigma_px, mode="constant", truncate=3.0)
+        return Data(grey / np.maximum(here, 1e-6), np.asarray(here > 0.98), self.noise, self.corner)
+
     def binned(self, n: int) -> Data:
         """Means over n x n pixels whose boundaries are the frame's multiples of n."""
         if n == 1:
