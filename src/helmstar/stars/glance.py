@@ -45,10 +45,11 @@ def glance(
         for _, (_, found) in zip(range(CHUNKS), chunks):
             if found is None or found.score[0] < LEAST_SCORE:
                 continue
-            fit = verify(sky, level, d, found.R[0], float(found.f[0]), freedom, first_gate=2.5, rounds=2)
-            if fit is None or len(fit.stars) < FEWEST or probability_false([fit]) >= SHARE * limit:
-                continue
-            return plain(sky, fit, d.order[fit.detections], q_SB)
+            # One step is enough for most; a second one is there for hypotheses of a short pair.
+            for rounds in (1, 2):
+                fit = verify(sky, level, d, found.R[0], float(found.f[0]), freedom, first_gate=2.5, rounds=rounds)
+                if fit is not None and len(fit.stars) >= FEWEST and probability_false([fit]) < SHARE * limit:
+                    return plain(sky, fit, d.order[fit.detections], q_SB)
     return None
 
 
