@@ -91,7 +91,8 @@ class Stage:
         some, self.begin = self.pairs[self.begin : end], end
         for k, part in self.levels:
             for looked, found in hypotheses(self.sky.level(k), self.n, self.d, some, part, keep, chunk):
-                yield k, looked, found
+                # Without magnitudes each catalogue pair is laid both ways.
+                yield k, looked if self.d.magnitude is not None else 2 * looked, found
 
 
 def detection_pairs(d: Detections) -> np.ndarray:

@@ -32,8 +32,8 @@ MISSTATED, STATED_ODDS, RETRY_WORK = 0.1, 10.0, 800_000
 """How wrong a stated field may be, relatively, the odds against its being wrong at all, and the catalogue pairs this is worth."""
 WORTH = tuple(4e-8 * 2.0**k for k in range(8, -1, -1))
 """Solutions that a look at one more catalogue pair must promise, from first to last (`hypotheses.Stage`)."""
-WORK = 2_500_000
-"""Catalogue pairs that are looked at before the search gives up, whatever the next one promises."""
+WORK = 2_200_000
+"""Catalogue pairs, once for each way they are laid, that are looked at before the search gives up, whatever the next promises."""
 
 
 @dataclass(frozen=True)
