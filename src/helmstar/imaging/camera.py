@@ -118,7 +118,7 @@ class Camera:
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = np.where(d[..., 2:] > 0.0, d[..., :2] / d[..., 2:], np.nan)
         xy = np.where(np.sum(xy**2, axis=-1, keepdims=True) <= self._reach**2, xy, np.nan)
-        xd, yd = self._distort(xy[..., 0], xy[..., 1])[:2]
+        xd, yd = self.distort(xy[..., 0], xy[..., 1])[:2]
         return np.stack([self.cx + self.focal_px * xd, self.cy + self.focal_px / self.aspect * yd], axis=-1)
 
     def inside(self, xy_px: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
@@ -130,7 +130,7 @@ class Camera:
     def pixel_covariance(self, xy_px: np.ndarray, covariance_px: np.ndarray) -> np.ndarray:
         """Covariance (n, 2, 2), rad^2, of the tangent-plane position (x, y) of S for pixel positions (n, 2) with (n, 2, 2)."""
         xy = self._plane(np.asarray(xy_px, float))
-        _, _, a, b, c, d = self._distort(xy[..., 0], xy[..., 1])
+        _, _, a, b, c, d = self.distort(xy[..., 0], xy[..., 1])
         scale = np.array([self.focal_px, self.focal_px / self.aspect])
         J = np.stack([np.stack([a, b], -1), np.stack([c, d], -1)], -2) * scale[:, None]
         inverse = np.linalg.inv(J)
@@ -164,7 +164,7 @@ class Camera:
         x, y = np.array([-0.5, self.width - 0.5]), np.array([-0.5, self.height - 0.5])
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(4, 2)
 
-    def _distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+    def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
         """x', y' and the derivatives dx'/dx, dx'/dy, dy'/dx, dy'/dy."""
         k1, k2, p1, p2, k3 = self.distortion
         r2 = x * x + y * y
@@ -185,7 +185,7 @@ class Camera:
         reach = self._reach
         with np.errstate(all="ignore"):
             for _ in range(_NEWTON_STEPS):
-                fx, fy, a, b, c, d = self._distort(x, y)
+                fx, fy, a, b, c, d = self.distort(x, y)
                 ex, ey = fx - xd, fy - yd
                 det = a * d - b * c
                 dx, dy = (d * ex - b * ey) / det, (a * ey - c * ex) / det
@@ -195,7 +195,7 @@ class Camera:
                     x, y = x * back, y * back
                 if not np.nanmax(np.abs(dx) + np.abs(dy), initial=0.0) > 1e-15:
                     break
-            fx, fy = self._distort(x, y)[:2]
+            fx, fy = self.distort(x, y)[:2]
             good = np.hypot(fx - xd, fy - yd) < 1e-9
         return np.where(good[..., None], np.stack([x, y], axis=-1), np.nan)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 
@@ -16,10 +15,10 @@ from .background import between, mesh_of
 from .centroid import Fit, fit, gain_of
 from .frame import Centroids, Image
 from .pyramid import TILES, Peaks, find_peaks, halve
+from .windows import Windows, around, in_structure, windows
 
 HALF = (3, 5, 9)
 """Half the side of a star's window at each level, px."""
-_BORDER = 2
 _BRIGHT = 15.0
 _MISFIT = 1.5  # chi-square per pixel above which the model, not noise, is what is wrong
 _COARSE = 1.8  # px; optics broader than this need the coarsest level
@@ -111,10 +110,10 @@ def detect_near(
         return _nothing()
     level = optics.level
     reach, quantum = int(np.ceil(reach_px)), _quantum(image)
-    around = reach + 2 + (3 << level)
-    w = _around(image.array, at[:, 0], at[:, 1], around)
+    side = reach + 2 + (3 << level)
+    w = around(image.array, at[:, 0], at[:, 1], side)
     if dark is not None:
-        w -= _around(dark, at[:, 0], at[:, 1], around)
+        w -= around(dark, at[:, 0], at[:, 1], side)
     ordered = np.sort(w.reshape(len(w), -1)[:, ::3], axis=1)
     count = ordered.shape[1]
     sky = ordered[:, count // 2]
@@ -178,7 +177,7 @@ def _at_scale(
         return None
     width, full = np.array(optics.width), array[y, x] >= 0.98 * image.saturation
     if full.any():  # a few full pixels are filled by the fit; many need a window as wide as the light reaches
-        light = _around(array, x[full], y[full], HALF[level]) >= 0.98 * image.saturation
+        light = around(array, x[full], y[full], HALF[level]) >= 0.98 * image.saturation
         full[full] = light.sum(axis=(1, 2)) > _FULL
     parts, widths = [], []
     for k, mine in ((level, ~full), (min(level + 1, 2), full)):
@@ -299,20 +298,9 @@ def _strongest(values: np.ndarray, count: int) -> np.ndarray:
     return np.argsort(-values, kind="stable")[:count]
 
 
-def _around(array: np.ndarray, x: np.ndarray, y: np.ndarray, half: int) -> np.ndarray:
-    """Windows (n, m, m), float32, edges repeated."""
-    d = np.arange(-half, half + 1)
-    height, width = array.shape
-    rows, columns = y[:, None] + d, x[:, None] + d
-    if x.size and not (x.min() >= half and y.min() >= half and x.max() < width - half and y.max() < height - half):
-        np.clip(rows, 0, height - 1, out=rows)
-        np.clip(columns, 0, width - 1, out=columns)
-    return array.reshape(-1).take((rows * width)[:, :, None] + columns[:, None, :]).astype(np.float32)
-
-
 def _wider_than_a_pixel(array: np.ndarray, peaks: Peaks, quantum: float) -> np.ndarray:
     """Which places of level 0 have light beside their brightest pixel, in both directions, as even the sharpest optics give."""
-    w = _around(array, peaks.x, peaks.y, 2)
+    w = around(array, peaks.x, peaks.y, 2)
     # The filter is 16 times the local mean of light: sky in a pixel from the filtered value's.
     f = w.reshape(len(w), 25) @ _WEIGHTS
     sky = (f - peaks.excess) / np.float32(16.0)
@@ -337,91 +325,11 @@ def _brightest_of(array: np.ndarray, peaks: Peaks, level: int, threshold: float)
     """Places of a coarse level in the image's pixels, and which of them stay above the noise without their brightest pixel."""
     size = 1 << level
     x, y = peaks.x * size + size // 2, peaks.y * size + size // 2
-    w = _around(array, x, y, size)
+    w = around(array, x, y, size)
     flat = np.sort(w.reshape(len(w), w.shape[1] ** 2), axis=1)
     # Without one pixel: it counts at most with the filter's middle weight.
     without = peaks.excess - 4.0 * (flat[:, -1] - flat[:, -3])
     return x, y, without > 0.7 * threshold * peaks.noise
-
-
-@dataclass(frozen=True)
-class _Windows:
-    """Windows of n places at one level: inner (n, m, m) pixels, ring (n, k) pixels around, filled (n, m, m) what says nothing.
-
-    noise: (n,) spread of the ring; grain: (n,) the same without what is smooth.
-    """
-
-    inner: np.ndarray
-    ring: np.ndarray
-    full: np.ndarray
-    filled: np.ndarray
-    outside: np.ndarray
-    sky: np.ndarray
-    noise: np.ndarray
-    grain: np.ndarray
-    above: np.ndarray
-    x0: np.ndarray
-    y0: np.ndarray
-
-
-def _windows(
-    array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, half: int, floor: np.ndarray | float
-) -> _Windows:
-    reach, n = half + _BORDER, len(x)
-    w = _around(array, x, y, reach)
-    border, steps_from, steps_to = _ring(half)
-    pixels = w.reshape(n, -1)
-    ring = pixels.take(border, axis=1)
-    ordered = np.sort(ring, axis=1)
-    count = ring.shape[1]
-    sky = ordered[:, int(0.2 * count) : int(0.8 * count)].mean(axis=1)
-    noise = np.maximum((ordered[:, int(0.8413 * count)] - ordered[:, int(0.1587 * count)]) / 2, floor)
-    inner = w[:, _BORDER:-_BORDER, _BORDER:-_BORDER]
-    above = np.maximum(inner - sky[:, None, None], np.float32(0.0))
-    full = inner >= 0.98 * image.saturation
-    outside = np.zeros(inner.shape, bool)
-    at_edge = np.flatnonzero((x < reach) | (y < reach) | (x >= array.shape[1] - reach) | (y >= array.shape[0] - reach))
-    if at_edge.size:
-        whole = np.arange(-reach, reach + 1)
-        off_y, off_x = y[at_edge, None] + whole, x[at_edge, None] + whole
-        off_y, off_x = (off_y < 0) | (off_y >= array.shape[0]), (off_x < 0) | (off_x >= array.shape[1])
-        off = off_y[:, :, None] | off_x[:, None, :]
-        # What an edge repeats is no structure.
-        beyond = off.reshape(len(off), -1).take(border, axis=1)
-        ring[at_edge] = np.where(beyond, sky[at_edge, None], ring[at_edge])
-        outside[at_edge] = off[:, _BORDER:-_BORDER, _BORDER:-_BORDER]
-        above *= ~outside
-    core = above[:, half - 2 : half + 3, half - 2 : half + 3] + np.float32(1e-9)
-    d, rows, columns = np.arange(-2, 3, dtype=np.float32), core.sum(axis=2), core.sum(axis=1)
-    total = rows.sum(axis=1)
-    # From pixel to pixel along the border's rows and columns: structure that is smooth does not count as noise here.
-    steps = np.sort(np.abs(pixels.take(steps_to, axis=1) - pixels.take(steps_from, axis=1)), axis=1)
-    grain = np.minimum(noise, np.maximum(steps[:, int(0.6827 * steps.shape[1])] / np.sqrt(2.0), floor))
-    x0, y0 = columns @ d / total, rows @ d / total
-    return _Windows(inner, ring, full, full | outside, outside, sky, noise, grain, above, x0, y0)
-
-
-@cache
-def _ring(half: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Flat indices into a window (m, m) of the border around it, and of neighbours along its outermost rows and columns."""
-    m = 2 * (half + _BORDER) + 1
-    mask = np.ones((m, m), bool)
-    mask[_BORDER:-_BORDER, _BORDER:-_BORDER] = False
-    at = np.arange(m * m).reshape(m, m)
-    rows, columns = at[[0, -1]], at[:, [0, -1]]
-    before = np.concatenate([rows[:, :-1].ravel(), columns[:-1].ravel()])
-    after = np.concatenate([rows[:, 1:].ravel(), columns[1:].ravel()])
-    return np.flatnonzero(mask), before, after
-
-
-@cache
-def _sectors(half: int) -> tuple[np.ndarray, np.ndarray]:
-    """Ring pixels in the order of the eight directions they lie in, and where each direction starts."""
-    d = np.arange(-half - _BORDER, half + _BORDER + 1)
-    angle = np.arctan2(d[:, None], d[None, :]).ravel()[_ring(half)[0]]
-    number = np.rint(angle / (np.pi / 4)).astype(int) % 8
-    order = np.argsort(number, kind="stable")
-    return order, np.searchsorted(number[order], np.arange(8))
 
 
 def _optics(
@@ -431,24 +339,12 @@ def _optics(
     some = np.flatnonzero((snr > _BRIGHT) & (level < 2))[:_FOR_WIDTH]
     if some.size < 3:
         return None
-    w = _windows(array, image, x[some], y[some], HALF[1], 1e-9)
-    clear = ~w.filled.any(axis=(1, 2)) & ~_in_structure(w, HALF[1])
+    w = windows(array, image, x[some], y[some], HALF[1], 1e-9)
+    clear = ~w.filled.any(axis=(1, 2)) & ~in_structure(w, HALF[1])
     if clear.sum() < 3:
         return None
     f = fit(w.inner[clear], w.x0[clear], w.y0[clear], w.sky[clear], w.noise[clear], np.ones(2), w.filled[clear], 0.5, 4)
     return np.median(f.sigma, axis=0)
-
-
-def _in_structure(w: _Windows, half: int) -> np.ndarray:
-    """Which places lie on a ridge (both sides of the ring bright along one line) or at the edge of something large."""
-    peak = np.max(w.above[:, half - 1 : half + 2, half - 1 : half + 2], axis=(1, 2))
-    order, starts = _sectors(half)
-    ring = w.ring.take(order, axis=1)
-    ring -= w.sky[:, None]
-    most = np.maximum.reduceat(ring, starts, axis=1)
-    mean = np.add.reduceat(ring, starts, axis=1) / np.diff(np.append(starts, ring.shape[1]))
-    ridge = (np.minimum(most[:, :4], most[:, 4:]) > (0.3 * peak + 3.5 * w.grain)[:, None]).any(axis=1)
-    return ridge | ((np.abs(mean) > (0.2 * peak + w.grain)[:, None]).sum(axis=1) >= 3)
 
 
 def _measure(
@@ -458,13 +354,13 @@ def _measure(
     """Fit the places of one level and keep those that are stars. widths: gets the fitted sigmas (n, 2) of these."""
     half = HALF[level]
     rounding = quantum / np.sqrt(12.0)
-    w = _windows(array, image, x, y, half, np.minimum(floor, rounding))
-    calm = np.flatnonzero(~_in_structure(w, half))
+    w = windows(array, image, x, y, half, np.minimum(floor, rounding))
+    calm = np.flatnonzero(~in_structure(w, half))
     if not calm.size:
         return _nothing()
     if calm.size < len(x):
         x, y, snr, floor = x[calm], y[calm], snr[calm], floor[calm]
-        w = _Windows(**{k: v[calm] for k, v in vars(w).items()})
+        w = Windows(**{k: v[calm] for k, v in vars(w).items()})
     expected = np.full(2, _WIDTH[level]) if width is None else width
     f = fit(w.inner, w.x0, w.y0, w.sky, w.noise, expected, w.filled, 0.25 if width is not None else 0.35)
     clear = (snr > _BRIGHT) & ~w.filled.any(axis=(1, 2))

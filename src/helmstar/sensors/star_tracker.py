@@ -327,4 +327,4 @@ def _centre_of(camera: Camera) -> tuple[float, float]:
 
 def _distorted(camera: Camera, x: float, y: float) -> tuple[float, ...]:
     """As the camera does it for arrays: x', y', and dx'/dx, dx'/dy, dy'/dx, dy'/dy."""
-    return camera._distort(x, y)  # pyright: ignore[reportArgumentType, reportReturnType]
+    return camera.distort(x, y)  # pyright: ignore[reportArgumentType, reportReturnType]

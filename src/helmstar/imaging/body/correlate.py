@@ -45,6 +45,8 @@ FLOOR_PX, LAW_FLOOR_PX, LAW_FLOOR = 0.002, 0.006, 3e-5
 """1 sigma of what templates leave: of rendering, px, and of laws that the family comes near, px and per px of diameter."""
 HOPELESS, EXPLAINED = 10.0, 0.8
 """Squares per degree of freedom from which a fit that does not settle, or that explains less of the light's squares, is none."""
+TEMPLATE, FIGURE = 3e-4, 2.0
+"""Error of templates over the light; variance of a free figure's fit over that of a linear one: its valleys bend."""
 STILL, LINEAR = 0.02, 0.06
 """A step is the last that lowers the sum of squares by less, in units of the noise, or that moves edges by less, in sigma of the
 optics: what the second order would add to it is a few per cent of it. It is taken without another template."""
@@ -265,8 +267,10 @@ def _outcome(problem: _Problem, s: _State, J: np.ndarray, converged: bool) -> Fi
     side = max(4, round(0.12 * problem.scene.diameter_px()))
     # Residuals that go together over patches are no noise: the sandwich of what each patch pulls says how much they move the fit.
     more = C @ _misfit(Kw * s.rest[:, None], problem.at[3], problem.at[2], side) @ C
-    C = (C * max(1.0, chi2) + _positive(more - C))[:q, :q]
     light = s.D[:, :-1] @ s.found[:-1]
+    # Templates are wrong too, by shares of the light over patches: little beside noise, except where many pixels make noise small.
+    wrong = C @ _misfit(Kw * (TEMPLATE * light)[:, None], problem.at[3], problem.at[2], side) @ C
+    C = (C * max(1.0, chi2) * (FIGURE if problem.free else 1.0) + _positive(more - C) + wrong)[:q, :q]
     snr = float(light @ (problem.w * (s.rest + light))) / math.sqrt(max(float(problem.w @ light**2), 1e-300))
     explained = 1.0 - float(problem.w @ s.rest**2) / max(float(problem.w @ problem.y**2), 1e-300)
     return Fit(problem.trial(s.p), C, chi2, s.found[:-1], snr, converged, problem.shot, math.exp(s.p[3]), explained)

@@ -71,14 +71,10 @@ class Scene:
         """Images (height, width) of the law and of each of the family, after the optics; their sum by `weights` if given."""
         left, top, width, height = window
         small = self.diameter_px(trial.size)
-        # The rim's quadrature is right at any size of cells: these only have to sample optics and shading.
-        per_px = (
-            int(np.clip(math.ceil(max(1.2 / max(self.psf_sigma_px, 0.3), 30.0 / small)), 1, 8))
-            if small < 40
-            else 2
-            if small < 100
-            else 1
-        )
+        # The rim's quadrature is right at any size of cells: these only have to sample optics and shading. A free figure is told
+        # from another by so little that the optics must be sampled twice a pixel at any size.
+        per_px = math.ceil(max(1.2 / max(self.psf_sigma_px, 0.3), 30.0 / small))
+        per_px = min(per_px, 8) if small < 40 else 2 if small < 100 or trial.stretch is not None else 1
         blur = math.ceil(_REACH * self.psf_sigma_px) + 1
 
         def shade(mu0: np.ndarray, mu: np.ndarray, alpha: np.ndarray | float) -> list[np.ndarray]:
