@@ -40,6 +40,9 @@ class BodyTable(_Table):
     )
     radius_sigma: Share = Field(default=0.05, description="relative 1 sigma of its size")
     shape_sigma: Share = Field(default=0.0, description="relative 1 sigma of each of its axes")
+    albedo_sigma: Share = Field(
+        default=0.05, description="relative 1 sigma of bright and dark spots a third of it across"
+    )
     q_tn: Quaternion = Field(
         default=[0.0, 0.0, 0.0, 1.0], description="x, y, z, w: N to the body's axes at [initial] time"
     )
@@ -154,7 +157,7 @@ def read_body(path: Path) -> BodyFile:
         shape = sphere(1e3 * (b.radius_km or 0.0))
     try:
         law = None if b.law is None else law_of(b.law, **b.law_parameters)
-        target = Target(shape, law, b.law_known, b.radius_sigma, b.shape_sigma)
+        target = Target(shape, law, b.law_known, b.radius_sigma, b.shape_sigma, b.albedo_sigma)
     except ValueError as error:
         raise ConfigurationError(f"{path}: body: {error}") from None
     return BodyFile(target, b, tables.initial)

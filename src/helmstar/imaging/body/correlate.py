@@ -31,6 +31,7 @@ from .target import (
     FOUND,
     NO_BODY,
     SATURATED,
+    SPOT,
     Detector,
     FigureCentre,
     Pose,
@@ -270,6 +271,11 @@ def _outcome(problem: _Problem, s: _State, J: np.ndarray, converged: bool) -> Fi
     light = s.D[:, :-1] @ s.found[:-1]
     # Templates are wrong too, by shares of the light over patches: little beside noise, except where many pixels make noise small.
     wrong = C @ _misfit(Kw * (TEMPLATE * light)[:, None], problem.at[3], problem.at[2], side) @ C
+    albedo = problem.scene.target.albedo_sigma
+    if albedo > 0.0:
+        spot = max(2, round(SPOT * problem.scene.diameter_px()))
+        spotted = C @ _misfit(Kw * (albedo * light)[:, None], problem.at[3], problem.at[2], spot) @ C
+        more = more + _positive(spotted - more)  # residuals are of the same spots
     C = (C * max(1.0, chi2) * (FIGURE if problem.free else 1.0) + _positive(more - C) + wrong)[:q, :q]
     snr = float(light @ (problem.w * (s.rest + light))) / math.sqrt(max(float(problem.w @ light**2), 1e-300))
     explained = 1.0 - float(problem.w @ s.rest**2) / max(float(problem.w @ problem.y**2), 1e-300)

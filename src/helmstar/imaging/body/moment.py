@@ -25,7 +25,7 @@ from ..frame import Image
 from .phase import Nodes, nodes
 from .photometry import Hapke, Lambert, Law, LommelSeeliger, McEwen, Minnaert
 from .shape import Ellipsoid, Shape
-from .target import AMBIGUOUS, CUT, DARK, FOUND, NO_BODY, SATURATED, Detector, FigureCentre, Pose, Target, nothing
+from .target import AMBIGUOUS, CUT, DARK, FOUND, NO_BODY, SATURATED, SPOT, Detector, FigureCentre, Pose, Target, nothing
 
 LAWS_TRIED: tuple[Law, ...] = (
     Lambert(),
@@ -270,7 +270,23 @@ def offsets(camera: Camera, target: Target, pose: Pose, centre_px: np.ndarray) -
         C += (tried - offset).T @ (tried - offset) / len(tried)
     C += np.outer(offset, offset) * pose.scale_sigma(target) ** 2
     C += np.eye(2) * (_SHAPE_GAIN * target.shape_sigma) ** 2 * float(offset @ offset)
+    if target.albedo_sigma > 0.0:
+        C += target.albedo_sigma**2 * _spots(points, target.law or LAWS_TRIED[0], camera, target, pose)
     return offset, C
+
+
+def _spots(points: Nodes, law: Law, camera: Camera, target: Target, pose: Pose) -> np.ndarray:
+    """Covariance (2, 2), px^2, of the centroid where spots SPOT of the diameter across are brighter by 1, each for itself."""
+    light = points.light(law)
+    total = float(light.sum())
+    if not total > 0.0:
+        return np.zeros((2, 2))
+    side = SPOT * 2.0 * target.shape.mean_radius * camera.focal_px / pose.distance
+    place = np.floor((points.xy_px - points.xy_px.min(axis=0)) / side).astype(int)
+    spot = place[:, 0] + (place[:, 0].max() + 1) * place[:, 1]
+    pull = light[:, None] * (points.xy_px - light @ points.xy_px / total) / total
+    of_each = np.stack([np.bincount(spot, p) for p in pull.T], axis=1)
+    return of_each.T @ of_each
 
 
 def centre_from_moment(

@@ -17,22 +17,26 @@ SATURATED = "saturated"
 DARK = "too dark"
 AMBIGUOUS = "ambiguous"
 FAILED = "no fit"
+SPOT = 0.3
+"""Size of spots over the diameter: large ones move centres most, and a few make up a body."""
 STATUSES = (FOUND, NO_BODY, CUT, SATURATED, DARK, AMBIGUOUS, FAILED)
 
 
 @dataclass(frozen=True)
 class Target:
     """shape: the figure. law: how it reflects, None where nothing is known. law_known: whether that law is the truth; if not,
-    the covariance allows for others. radius_sigma, shape_sigma: relative 1 sigma of its size, and of its axes each for itself."""
+    the covariance allows for others. radius_sigma, shape_sigma: relative 1 sigma of its size, and of its axes each for itself.
+    albedo_sigma: relative 1 sigma of the light of spots SPOT of the diameter across, about what the law says."""
 
     shape: Shape
     law: Law | None = None
     law_known: bool = False
     radius_sigma: float = 0.0
     shape_sigma: float = 0.0
+    albedo_sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("radius_sigma", "shape_sigma"):
+        for name in ("radius_sigma", "shape_sigma", "albedo_sigma"):
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"{name} {getattr(self, name)}: must be from 0 to below 1")
         if self.law_known and self.law is None:
@@ -124,6 +128,6 @@ def nothing(status: str, method: str, message: str, diameter_px: float = float("
 
 
 __all__ = [
-    "AMBIGUOUS", "CUT", "DARK", "FAILED", "FOUND", "NO_BODY", "SATURATED", "STATUSES", "Detector", "FigureCentre", "Pose", "Target",
-    "nothing",
+    "AMBIGUOUS", "CUT", "DARK", "FAILED", "FOUND", "NO_BODY", "SATURATED", "SPOT", "STATUSES", "Detector", "FigureCentre",
+    "Pose", "Target", "nothing",
 ]  # fmt: skip
