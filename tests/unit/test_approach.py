@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from helmstar.backend import jax, jnp
 from helmstar.campaign.engine import Engine
+from helmstar.core import Gaussian
 from helmstar.errors import ConfigurationError
 from helmstar.evaluate.consistency import chi_square_band
 from helmstar.models.approach import (
@@ -26,8 +29,9 @@ from helmstar.models.approach import (
     predicted_passage,
 )
 from helmstar.scenarios import load
-from helmstar.scenarios.approach import Experiment, target_axes
+from helmstar.scenarios.approach import TERMINAL_VARIABLES, Experiment, target_axes
 from helmstar.scenarios.approach_data import nominal_start, start_factor, timeline
+from helmstar.scenarios.approach_terminal import Terminal, terminal_tracking
 
 DAY = 86400.0
 QUIET = {
@@ -260,16 +264,15 @@ def test_ignored_burn_errors_show_where_burns_are_rough():
     assert ignorant > 2 * honest
 
 
-def test_terminal_tracking_starts_from_the_hand_over():
-    """Its arrays, traced, are those that are recorded; `none` leaves them out."""
-    name, spec = load("approach", {"terminal.filter": "ekf"})
-    e = Experiment(spec, name)
-    call, draw = e.estimators["ekf"], e.simulate
-    data = jax.eval_shape(draw.function, *draw.arguments, jax.ShapeDtypeStruct((2,), int))
-    found = jax.eval_shape(lambda d: call.function(*call.arguments, d, **call.static), data)
-    assert set(found) == set(e.variables)
-    assert found["terminal_error_km"].shape == (2, 120, 3)
-    assert "terminal_error_km" not in experiment().variables
+def test_terminal_tracking_gives_what_is_recorded(library):
+    """Traced only: compiling it takes as long as all of the above. `helmstar run approach` is where it is seen to work."""
+    end, data = Terminal.of("ekf", 1)
+    belief = Gaussian(library.flight.start, jnp.eye(14))
+    track = partial(terminal_tracking, end)
+    found = jax.eval_shape(track, data, library.flight.start, belief, jnp.asarray(1200.0), jnp.asarray(0))
+    assert set(found) == set(TERMINAL_VARIABLES)
+    assert found["terminal_error_km"].shape == (120, 3)
+    assert not set(TERMINAL_VARIABLES) & set(library.variables)
 
 
 def test_campaign_report_and_metrics(tmp_path, library):
