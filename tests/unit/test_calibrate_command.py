@@ -183,7 +183,8 @@ def test_keys_of_a_calibration_are_checked(tmp_path):
     path = tmp_path / "cam.toml"
     for line, word in (
         ('centroid_scale = "big"', "centroid_scale"), ("focal_sigma_px = -1", "focal_sigma_px"), ("dark = 3", "dark"),
-        ("centroid_scale = 0", "centroid_scale"), ('dark = "none.npz"', "none.npz"),
+        ("centroid_scale = 0", "centroid_scale"), ("focal_sigma = 1", "unknown key"),
+        ('dark = "none.npz"', "none.npz"),
     ):  # fmt: skip
         path.write_text(TRUE.to_toml() + f"[calibration]\n{line}\n")
         with pytest.raises(ConfigurationError, match=word):

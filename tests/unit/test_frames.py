@@ -202,6 +202,13 @@ def test_tables_of_frames_that_cannot_be_used(tmp_path):
     solved = solve_frames(tmp_path, OPTICS, progress=False)
     assert not len(solved.row)
     assert [e["status"] for e in solved.entries] == ["unreadable", "unreadable"]
+    table.write_text("file,time_s,time_utc\na.png,5,2024-03-01T20:00:00\n,6,2024-03-01T20:00:01\n")
+    frames = find_frames(tmp_path)
+    assert frames.instants.absolute  # the date is worth more than plain seconds
+    assert [(p.row, p.kind, p.message) for p in frames.problems] == [(3, "unsolved", "names no file")]
+    table.write_text("file,time_utc\na.png,2150-03-01T20:00:00\n")
+    with pytest.raises(DataError, match="after 2099"):
+        solve_frames(tmp_path, OPTICS, progress=False)
 
 
 def test_misuse_of_the_command_is_explained(capsys, tmp_path, night):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from helmstar.cli import main
 from helmstar.imaging import Camera
 from helmstar.imaging.render import render
+from helmstar.io.images import read_image
 from helmstar.sensors.star_tracker import centre_angles, observer
 from helmstar.stars import load_catalog
 from helmstar.startracker.command import SolveOptions, tracker_of
@@ -99,6 +101,7 @@ def test_what_shows_no_stars_is_refused_in_its_place(capsys, tmp_path):
         (["--camera", "none.toml"], ["none.toml"]),
         (["--camera", "c.toml", "--fov", "3"], ["--fov and --camera"]),
         (["--time", "yesterday"], ["--time yesterday"]),
+        (["--time", "2500-01-01T00:00:00"], ["--time 2500", "2099"]),
     ],
 )
 def test_misuse_is_exit_code_1(capsys, tmp_path, argv, words):
@@ -115,6 +118,46 @@ def test_no_image_at_all_is_misuse_too(capsys):
     with pytest.raises(SystemExit) as e:
         main(["solve"])
     assert e.value.code == 1
+
+
+def test_a_drawing_for_each_image_of_one_name_and_none_over_a_file(capsys, tmp_path):
+    files = [tmp_path / d / "black.png" for d in "ab"]
+    for file in files:
+        file.parent.mkdir()
+        Picture.fromarray(np.zeros((40, 60), np.uint8)).save(file)
+    drawn = tmp_path / "drawn"
+    entries = solve(capsys, *map(str, files), "--fov", "12", "--plot", str(drawn))[1]["images"]
+    assert [e["plot"] for e in entries] == [str(drawn / "black-1.png"), str(drawn / "black-2.png")]
+    code, _, err = solve(capsys, str(files[0]), "--fov", "12", "--plot", str(files[1]))
+    assert (code, err) == (1, f"error: --plot {files[1]}: is a file; give a folder\n")
+
+
+def test_drawn_magnitudes_are_those_of_the_catalogue_that_was_used(tmp_path, monkeypatch):
+    """Another catalogue's indices are not Hipparcos's: here its stars stand in another order."""
+    from PIL import ImageDraw
+
+    from helmstar.sensors.star_tracker import StarTracker
+    from helmstar.startracker.plot import draw
+
+    whole = load_catalog(8.0)
+    order = np.random.default_rng(1).permutation(len(whole))
+    other = replace(whole, **{k: v[order] for k, v in vars(whole).items() if isinstance(v, np.ndarray)})
+    frame(tmp_path / "sky.png", 0)
+    image = read_image(tmp_path / "sky.png")
+    found = StarTracker(CAMERA).solve(image)
+    magnitude = dict(zip(whole.hip.tolist(), whole.magnitude, strict=True))
+    place = {int(h): i for i, h in enumerate(other.hip)}
+    known = [k for k, h in enumerate(found.identification.hip) if int(h) in place]
+    assert len(known) > 5
+    i = found.identification
+    mine = replace(
+        i, detections=i.detections[known], hip=i.hip[known], residuals_px=i.residuals_px[known],
+        stars=np.array([place[int(h)] for h in i.hip[known]]),
+    )  # fmt: skip
+    said = []
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", lambda self, xy, text, **_: said.append(text))
+    draw(image, replace(found, identification=mine), other, tmp_path / "drawn.png")
+    assert said[:-1] == [f"HIP {h}  {magnitude[int(h)]:.1f}" for h in mine.hip]
 
 
 def test_the_observer_moves_with_the_earth():

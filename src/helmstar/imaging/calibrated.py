@@ -48,6 +48,10 @@ def read_calibrated(path: Path) -> Calibrated:
     table = tomllib.loads(path.read_text(encoding="utf-8")).get(TABLE, {})
     if not isinstance(table, dict):
         raise ConfigurationError(f"{path}: {TABLE} must be a table")
+    unknown = sorted(set(table) - {*_NUMBERS, "dark"})
+    if unknown:
+        known = ", ".join((*_NUMBERS, "dark"))
+        raise ConfigurationError(f"{path}: [{TABLE}] has the unknown key {unknown[0]!r}; known: {known}")
     numbers: dict[str, float] = {}
     for key in _NUMBERS:
         value = table.get(key)
@@ -55,7 +59,8 @@ def read_calibrated(path: Path) -> Calibrated:
             continue
         good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) and value >= 0.0
         if not good or (key == "centroid_scale" and value == 0.0):
-            raise ConfigurationError(f"{path}: [{TABLE}] {key} must be a positive number, is {value!r}")
+            least = "more than 0" if key == "centroid_scale" else "0 or more"
+            raise ConfigurationError(f"{path}: [{TABLE}] {key} must be a number, {least}, is {value!r}")
         numbers[key] = float(value)
     name = table.get("dark")
     if name is not None and not isinstance(name, str):

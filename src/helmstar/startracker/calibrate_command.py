@@ -19,7 +19,7 @@ from ..progress import Progress
 from ..sensors.star_tracker import StarTracker
 from ..stars.identify import matrix_of_quaternion
 from .calibration import Fitted, Frame, fit_camera
-from .command import REASON, SolveOptions, tracker_of
+from .command import REASON, SolveOptions, check_plot, tracker_of
 
 _STARS = 250
 _DARK_FRAMES, _DARK_PIXELS = 25, 400_000_000
@@ -43,6 +43,7 @@ def run_calibrate(files: Sequence[Path], options: CalibrateOptions) -> dict[str,
 
     Raises HelmstarError for options that mean nothing and for stars that do not suffice.
     """
+    check_plot(options.plot)
     tracker = tracker_of(replace(options.solve, aspect=1.0 if options.aspect is None else options.aspect))
     frames: list[Frame] = []
     with Progress(len(files) > 1) as bar:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from ..imaging.calibrated import Calibrated, read_calibrated
 from ..progress import Progress
 from ..sensors.star_tracker import StarSolution, StarTracker, observer, observer_place
 from ..stars.catalog import Catalog, load_gaia
+from .dates import instant_of, julian_date_tt
 
 UNKNOWN_FIELD = (4.0, 30.0)
 """deg: what is tried where neither camera nor field is given."""
@@ -67,7 +69,10 @@ def tracker_of(options: SolveOptions, date_tt: float | None = None) -> StarTrack
     else:
         field = UNKNOWN_FIELD if options.fov is None else field_of(options.fov)
     year, velocity, position = None, None, None
-    date = date_tt if options.time is None else _julian_date(options.time)
+    date = date_tt
+    if options.time is not None:
+        instant = instant_of(options.time)
+        date = julian_date_tt(int(instant.day[0]), float(instant.second[0]))
     if date is not None:
         (year, velocity), position = observer(date), observer_place(date)
     return StarTracker(
@@ -83,34 +88,34 @@ def _catalog(name: str) -> Catalog | None:
     return load_gaia() if name == "gaia" else None
 
 
-def _julian_date(text: str) -> float:
-    """TT of a UTC time."""
-    import erfa
-    import pyarrow as pa
+def check_plot(folder: Path | None) -> None:
+    """Raise ConfigurationError for a --plot that no folder can be: before the work, not after it."""
+    if folder is not None and folder.exists() and not folder.is_dir():
+        raise ConfigurationError(f"--plot {folder}: is a file; give a folder")
 
-    from ..io.clock import from_texts
 
-    instants, good = from_texts(pa.array([text]), "utc")
-    if not bool(np.all(good)):
-        raise ConfigurationError(f"--time {text}: must be a UTC time such as 2019-07-29T20:47:26")
-    # TAI days and seconds since 2000-01-01T00:00:00; TT is 32.184 s ahead.
-    return float(erfa.DJ00) - 0.5 + float(instants.day[0]) + (float(instants.second[0]) + 32.184) / 86400.0
+def _drawings(files: Sequence[Path], folder: Path) -> list[Path]:
+    """A drawing for each file, of its name; where several have the name, with the number of the argument."""
+    count = Counter(f.stem for f in files)
+    return [folder / (f"{f.stem}.png" if count[f.stem] == 1 else f"{f.stem}-{k + 1}.png") for k, f in enumerate(files)]
 
 
 def run_solve(files: Sequence[Path], options: SolveOptions) -> dict[str, Any]:
     """The object of `--json`: one entry for each file, in order, whatever became of it. Raises HelmstarError for options that
     mean nothing."""
+    check_plot(options.plot)
     tracker = tracker_of(options)
+    drawings = [None] * len(files) if options.plot is None else _drawings(files, options.plot)
     entries = []
     with Progress(len(files) > 1) as bar:
         task = bar.add("images", len(files))
-        for file in files:
-            entries.append(_entry(tracker, file, options))
+        for file, drawing in zip(files, drawings, strict=True):
+            entries.append(_entry(tracker, file, drawing))
             bar.advance(task)
     return {"images": entries}
 
 
-def _entry(tracker: StarTracker, file: Path, options: SolveOptions) -> dict[str, Any]:
+def _entry(tracker: StarTracker, file: Path, drawing: Path | None) -> dict[str, Any]:
     from ..io.images import read_image
 
     begin = time.perf_counter()
@@ -124,10 +129,10 @@ def _entry(tracker: StarTracker, file: Path, options: SolveOptions) -> dict[str,
     ms = {"read": 1e3 * (read - begin), **{k: v for k, v in found.ms.items() if k != "total"}}
     entry["ms"] = {k: round(v, 3) for k, v in ms.items()}
     entry["ms_total"] = round(1e3 * (time.perf_counter() - begin), 3)
-    if options.plot is not None:
+    if drawing is not None:
         from .plot import draw
 
-        entry["plot"] = readable(str(draw(image, found, options.plot / f"{file.stem}.png")))
+        entry["plot"] = readable(str(draw(image, found, tracker.sky.catalog, drawing)))
     return entry
 
 
@@ -167,9 +172,9 @@ def entry_of(file: Path, found: StarSolution) -> dict[str, Any]:
 
 REASON = {
     "solved": "",
-    "too few stars": "fewer than three stars were detected",
-    "no match": "no attitude explains the detections better than chance",
-    "uncertain": "the best attitude is more probably false than --max-false allows",
+    "too few stars": "fewer than three stars were detected; expose longer, or focus",
+    "no match": "no attitude explains the detections better than chance; give a range as --fov, and no mirrored image",
+    "uncertain": "the best attitude is more probably false than --max-false allows; give an image of more stars",
 }
 
 

@@ -25,6 +25,7 @@ from ..io.table import read_table
 from ..progress import Progress
 from ..sensors.star_tracker import StarTracker
 from .command import REASON, SolveOptions, entry_of, tracker_of
+from .dates import check_date, julian_date_tt
 
 TABLE = "frames.csv"
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".fits", ".fit")
@@ -94,7 +95,9 @@ def find_frames(folder: Path) -> Frames:
 def _listed(path: Path) -> Frames:
     """Of the folder's table."""
     table = read_table(path)
-    time = next((name for name in NATIVE_TIME if name in table.columns), None)
+    # A date, where there is one beside plain seconds: it tells where the Earth was.
+    dated = sorted(NATIVE_TIME, key=lambda name: NATIVE_TIME[name] == "s")
+    time = next((name for name in dated if name in table.columns), None)
     if "file" not in table.columns or time is None:
         names = ", ".join(table.columns)
         raise DataError(f"{path}: must have the columns file and time_s or time_utc; it has {names}")
@@ -103,7 +106,10 @@ def _listed(path: Path) -> Frames:
     problems = list(table.problems)
     for i in np.flatnonzero(~good):
         problems.append(Problem(str(path), int(table.row[i]), "time_unreadable", f"{time} is no time", "dropped"))
-    keep = np.flatnonzero(good)
+    named = np.array([bool(name) for name in names], dtype=bool)
+    for i in np.flatnonzero(good & ~named):
+        problems.append(Problem(str(path), int(table.row[i]), "unsolved", "names no file", "dropped"))
+    keep = np.flatnonzero(good & named)
     files = tuple(path.parent / names[i] for i in keep)
     return Frames(str(path), files, instants.select(keep), table.row[keep], tuple(problems))
 
@@ -173,9 +179,12 @@ def _exif_date(tags: Mapping[int, Any]) -> str | None:
 def solve_frames(folder: Path, options: SolveOptions, progress: bool = True) -> SolvedFrames:
     """Solve all frames of a folder. Raises HelmstarError where there is nothing to solve; what is not solved is a problem."""
     frames = find_frames(folder)
-    trackers = _Trackers(options, frames.instants)
+    if frames.instants.absolute:
+        last = int(np.argmax(frames.instants.seconds()))
+        check_date(julian_date_tt(int(frames.instants.day[last]), float(frames.instants.second[last])), frames.source)
     time = frames.instants.seconds()
     entries: list[dict[str, Any]] = []
+    trackers = _Trackers(options, frames.instants)
     problems = list(frames.problems)
     found: list[tuple[int, np.ndarray, np.ndarray]] = []
     with Progress(progress) as bar:
@@ -212,8 +221,9 @@ class _Trackers:
         return self._tracker
 
     def _new(self, k: int) -> StarTracker:
-        date = 2451544.5 + float(self._instants.day[k]) + (float(self._instants.second[k]) + 32.184) / 86400.0
-        return tracker_of(self._options, date if self._instants.absolute else None)
+        if not self._instants.absolute:
+            return tracker_of(self._options)
+        return tracker_of(self._options, julian_date_tt(int(self._instants.day[k]), float(self._instants.second[k])))
 
 
 def _prediction(

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..imaging import Image
 from ..sensors.star_tracker import StarSolution
-from ..stars.catalog import load_catalog
+from ..stars.catalog import Catalog
 
 SIDE = 1600
 """Longest side of the drawing, px."""
@@ -17,8 +17,9 @@ ENLARGED = 20.0
 FOUND, MATCHED, WRONG = (250, 190, 60), (90, 220, 130), (255, 90, 90)
 
 
-def draw(image: Image, found: StarSolution, path: Path) -> Path:
-    """Write a PNG and return its path: circles for detections, green with HIP number and V for matched stars."""
+def draw(image: Image, found: StarSolution, catalog: Catalog, path: Path) -> Path:
+    """Write a PNG and return its path: circles for detections, green with HIP number and magnitude for matched stars of the
+    catalogue that they were found in."""
     from PIL import Image as Picture
     from PIL import ImageDraw
 
@@ -31,11 +32,10 @@ def draw(image: Image, found: StarSolution, path: Path) -> Path:
         x, y = place(xy)
         pen.ellipse((x - 7, y - 7, x + 7, y + 7), outline=FOUND)
     i = found.identification
-    magnitude = load_catalog().magnitude
     for k, star, hip, residual in zip(i.detections, i.stars, i.hip, i.residuals_px, strict=True):
         x, y = place(found.centroids.xy_px[k])
         pen.ellipse((x - 11, y - 11, x + 11, y + 11), outline=MATCHED, width=2)
-        pen.text((x + 13, y - 6), f"HIP {hip}  V {magnitude[star]:.1f}", fill=MATCHED)
+        pen.text((x + 13, y - 6), f"{f'HIP {hip}  ' if hip else ''}{catalog.magnitude[star]:.1f}", fill=MATCHED)
         dx, dy = residual * ENLARGED * scale
         pen.line((x, y, x + dx, y + dy), fill=WRONG, width=2)
     text = found.status

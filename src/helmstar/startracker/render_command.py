@@ -208,18 +208,15 @@ class _Clock:
             return self._origin.utc([seconds])[0]
 
     def tt(self, seconds: float) -> float:
-        return 2451544.5 + self._origin.day + (self._origin.second + seconds + 32.184) / 86400.0
+        from .dates import julian_date_tt
+
+        return julian_date_tt(self._origin.day, self._origin.second + seconds)
 
 
 def _clock(text: str) -> _Clock:
-    import pyarrow as pa
+    from .dates import instant_of
 
-    from ..io.clock import from_texts
-
-    instants, good = from_texts(pa.array([text]), "utc")
-    if not bool(np.all(good)):
-        raise ConfigurationError(f"--time {text}: must be a UTC time such as 2019-07-29T20:47:26")
-    return _Clock(instants.earliest())
+    return _Clock(instant_of(text).earliest())
 
 
 class _Sky:
