@@ -147,7 +147,7 @@ Exit code: 0 all solved, 2 some not, 1 misuse.""",
         "--time", metavar="UTC", help="time of the images: moves the stars and adds aberration (default: J2000)"
     )
     c.add_argument(
-        "--max-false", type=float, default=1e-6, metavar="P", help="largest probability to be false (default: 1e-6)"
+        "--max-false", type=float, default=1e-5, metavar="P", help="largest probability to be false (default: 1e-5)"
     )
     c.add_argument(
         "--catalog", choices=("hipparcos", "gaia"), default="hipparcos",

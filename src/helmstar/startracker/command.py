@@ -17,6 +17,7 @@ from ..imaging.calibrated import Calibrated, read_calibrated
 from ..progress import Progress
 from ..sensors.star_tracker import StarSolution, StarTracker, observer, observer_place
 from ..stars.catalog import Catalog, load_gaia
+from ..stars.identify import LIMIT
 from .dates import instant_of, julian_date_tt
 
 UNKNOWN_FIELD = (4.0, 30.0)
@@ -35,7 +36,7 @@ class SolveOptions:
     aspect: float = 1.0
     time: str | None = None
     plot: Path | None = None
-    limit: float = 1e-6
+    limit: float = LIMIT
     catalog: str = "hipparcos"
 
 
@@ -144,7 +145,14 @@ KEYS = (
 
 def _empty(file: Path, status: str, message: str, begin: float) -> dict[str, Any]:
     total = round(1e3 * (time.perf_counter() - begin), 3)
-    return {"file": readable(str(file)), "status": status, "message": message, **dict.fromkeys(KEYS), "ms_total": total}
+    return {
+        "file": readable(str(file)),
+        "status": status,
+        "message": message,
+        **dict.fromkeys(KEYS),
+        "ms": {},
+        "ms_total": total,
+    }
 
 
 def entry_of(file: Path, found: StarSolution) -> dict[str, Any]:
