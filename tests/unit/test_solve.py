@@ -88,6 +88,7 @@ def test_what_shows_no_stars_is_refused_in_its_place(capsys, tmp_path):
     assert status["noise.png"] in ("too few stars", "no match", "uncertain")
     assert "Traceback" not in err
     assert all(e["message"] for e in result["images"] if e["status"] != "solved")
+    assert all(set(e) == set(result["images"][0]) for e in result["images"])
 
 
 @pytest.mark.parametrize(

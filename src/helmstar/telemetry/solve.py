@@ -389,7 +389,7 @@ def problems_of(timeline: Timeline, epochs: Epochs, updates: Updates, gate: Gate
     for k in np.flatnonzero(updates.status != ACCEPTED):
         e = int(timeline.epoch[updates.index[k]])
         off = np.linalg.norm(updates.residual[k]) / ARCSEC
-        where = f"{off:.4g} arcsec from what the gyro leads to, " if np.isfinite(off) else ""
+        where = f"{off:.4g} arcsec from what was expected, " if np.isfinite(off) else ""
         limit = limits[updates.dof[k]]
         message = f"a jump: {where}NIS {updates.nis[k]:.4g} over the gate's {limit:.4g}"
         action = {FORCED: "used, its sigma enlarged", RESET: "the filter was restarted from it"}.get(
