@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import ConvexHull
 
 from helmstar.imaging import Camera, Image
 from helmstar.imaging.body import (
@@ -12,6 +14,7 @@ from helmstar.imaging.body import (
     Hapke,
     Lambert,
     LommelSeeliger,
+    Mesh,
     Minnaert,
     Pose,
     Target,
@@ -29,7 +32,8 @@ from helmstar.imaging.body.correlate import centre_from_fit
 from helmstar.imaging.body.limb import centre_from_limb
 from helmstar.imaging.body.moment import sky_of
 from helmstar.imaging.body.phase import lambert_factor
-from helmstar.imaging.render import Exposure
+from helmstar.imaging.body.render_body import body_light
+from helmstar.imaging.render import Exposure, sensor_counts
 
 CAMERA = Camera.from_fov(3.5, 1024, 1024)
 RADIUS = 2e3
@@ -201,3 +205,59 @@ def test_saturation_and_rivals_are_named():
     assert near.xy_px == pytest.approx([44.5, 44.5], abs=0.05)
     with pytest.raises(ValueError, match="must be one of"):
         find_centre(image, CAMERA, KNOWN, pose, method="guess")
+
+
+@pytest.mark.parametrize("find", [centre_from_moment, centre_from_fit])
+def test_spots_of_albedo_are_in_the_covariance(find):
+    """A smooth random map of 10% over the light moves every method; told of it, NEES of twelve frames is in its band."""
+    ratios, told = [], Target(sphere(RADIUS), Lambert(), albedo_sigma=0.1)
+    for seed in range(12):
+        image, truth, pose = scene(16.0, 10.0 + 50.0 * (seed % 2), seed)
+        law, rng = LommelSeeliger(), np.random.default_rng(seed)
+        r = pose.position(CAMERA, truth.centre_px)
+        light = body_light(CAMERA, told.shape, r, np.eye(3), pose.sun_C, law, truth.window, EXPOSURE.psf_sigma_px)
+        spots = gaussian_filter(rng.standard_normal(light.shape), 16.0 / 12.0)
+        light = 3e4 * light * np.maximum(1.0 + 0.1 * spots / spots.std(), 0.0)
+        light += (EXPOSURE.sky_e_s + EXPOSURE.dark_e_s) * EXPOSURE.duration
+        image = sensor_counts(light.astype(np.float32), EXPOSURE, rng)
+        found = find(image, CAMERA, told, pose, DETECTOR, corner=truth.window[:2])
+        assert found.status == "found"
+        ratios.append(nees(found, truth))
+    assert 0.2 < np.mean(ratios) < 3.0
+
+
+def test_free_figures_and_limbs_have_honest_covariances():
+    """Mean NEES in its band: a figure with free stretches at 12 px, limbs over phases and laws."""
+    stretched, limbs = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        shape = Ellipsoid(tuple(RADIUS * np.exp(rng.normal(0.0, 0.1, 3))))
+        image, truth, pose = scene(12.0, (10.0, 60.0, 100.0)[seed % 3], seed, shape=shape)
+        target = Target(sphere(RADIUS), Lambert(), law_known=True, radius_sigma=0.1, shape_sigma=0.1)
+        stretched.append(nees(centre_from_fit(image, CAMERA, target, pose, DETECTOR, corner=truth.window[:2]), truth))
+        law = (LommelSeeliger(), Hapke(), Lambert(), Minnaert(k=0.7))[seed // 2]
+        image, truth, pose = scene(70.0, (10.0, 60.0)[seed % 2], seed, law=law)
+        target = Target(sphere(1.03 * RADIUS), None, radius_sigma=0.1)
+        limbs.append(nees(centre_from_limb(image, CAMERA, target, pose, DETECTOR, corner=truth.window[:2]), truth))
+    assert 0.2 < np.mean(stretched) < 3.0
+    assert 0.2 < np.mean(limbs) < 3.0
+
+
+def test_a_mesh_is_found_by_fit_and_moment():
+    """Hills of 5% on a hull of 1500 points, told as they are: a known law's bar, and errors as the covariance says."""
+    k = np.arange(1500) + 0.5
+    polar, east = np.arccos(1.0 - k / 750.0), np.pi * (1.0 + 5.0**0.5) * k
+    u = np.stack([np.cos(east) * np.sin(polar), np.sin(east) * np.sin(polar), np.cos(polar)], axis=1)
+    faces = ConvexHull(u).simplices
+    inwards = np.linalg.det(u[faces]) < 0.0
+    faces[inwards] = faces[inwards][:, ::-1]
+    hills = 1.0 + 0.05 * np.sin(5.0 * u[:, :1]) * np.cos(4.0 * u[:, 1:2])
+    mesh = Mesh(RADIUS * u * hills * [1.2, 1.0, 0.9], faces)
+    for find in (centre_from_fit, centre_from_moment):
+        ratios = []
+        for seed in range(3):
+            image, truth, pose = scene(20.0, 60.0, seed, shape=mesh)
+            found = find(image, CAMERA, Target(mesh, Lambert(), True), pose, DETECTOR, corner=truth.window[:2])
+            assert np.abs(found.centre_px - truth.centre_px).max() < 0.02
+            ratios.append(nees(found, truth))
+        assert np.mean(ratios) < 3.0  # chi2 of 6 degrees over 6: above once in 170

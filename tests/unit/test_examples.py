@@ -34,6 +34,15 @@ def test_filter_by_hand():
     assert 2.0 < result["filtered"]["nees"] < 14.0
 
 
+def test_an_approach_by_its_frames(tmp_path):
+    done = load("opnav").main(tmp_path)
+    assert np.abs(done["over_sigma"]).max() < 3.0
+    t = done["result"]["trajectory"]
+    assert t["frames_used"] == 10
+    assert max(t["position_sigma_km"][1:]) < 1.0  # 8 km before; 0.01 deg of pointing is 0.5 km at 2800 km
+    assert all(f["status"] == "found" for f in done["result"]["frames"])
+
+
 def test_the_example_record_is_what_its_script_writes(tmp_path):
     load("make_telemetry").main(tmp_path)
     for name in ("gyro.csv", "stars.csv", "still.csv"):

@@ -39,7 +39,7 @@ LEAST_CRESCENT_PX = 10.0
 STEP_PX = 0.25
 SCANS = 240
 _HALF = math.radians(82.0)  # of the lit side, around the Sun's direction
-FLOOR_PX = 0.06
+FLOOR_PX = 0.04
 """1 sigma that scans have in common: of bilinear sampling and of profiles cut after the linear term."""
 
 
