@@ -49,7 +49,6 @@ from helmstar.stars.synthetic import random_scene, scene
 PARTS = ("frames", "lists", "random", "time")
 SIZE = (1024, 1024)
 CASES = {"2 px of noise": {"noise_px": 2.0}, "50 false": {"false": 50}, "60% dropped": {"dropped": 0.6}}
-LISTED_FIELDS = (12.0, 20.0)
 FALSE_ARCSEC = 300.0
 FALSE_ROLL = 0.5 * 3600.0
 YEAR = 2025.0
@@ -316,7 +315,10 @@ def in_lists(solvers: dict[str, Solver], cases: dict[str, list[dict]]) -> dict:
                 for case, lists in cases.items()
             }
 
-        done = dict(zip(solvers, pool.map(all_cases, solvers)))
+        slow_first = sorted(
+            solvers, key=lambda name: ("cedar-solve", "LOST").index(name) if name in ("cedar-solve", "LOST") else 2
+        )
+        done = dict(zip(slow_first, pool.map(all_cases, slow_first)))
     return {case: {name: done[name][case] for name in solvers} for case in cases}
 
 
@@ -339,13 +341,13 @@ def measured(args: argparse.Namespace, solvers: dict[str, Solver]) -> dict:
     if "lists" in args.parts:
         cases = {
             f"{name}, {fov:g} deg": scenes_of(fov, args.scenes, kinds)
-            for fov in LISTED_FIELDS
+            for fov in args.fields
             for name, kinds in CASES.items()
         }
         out |= in_lists(listing, cases)
     if "random" in args.parts:
         listing.pop("helmstar, fluxes unused")
-        out |= in_lists(listing, {f"{n} detections, no sky": empty_of(n, args.scenes) for n in (30, 300)})
+        out |= in_lists(listing, {f"{n} detections, no sky": empty_of(n, args.empty) for n in (30, 300)})
     return out
 
 
@@ -377,6 +379,8 @@ def main() -> None:
     parser.add_argument("--frames", type=Path, metavar="FOLDER")
     parser.add_argument("--lost", type=Path, metavar="FOLDER")
     parser.add_argument("--scenes", type=positive, default=100)
+    parser.add_argument("--empty", type=positive, default=50, metavar="N", help="lists of each size in part random")
+    parser.add_argument("--fields", type=float, nargs="+", default=[12.0, 20.0], metavar="DEG", help="of part lists")
     parser.add_argument("--rendered", type=positive, default=20, metavar="N")
     parser.add_argument("--timeout", type=float, default=1.0, metavar="S")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))

@@ -158,7 +158,7 @@ class Lost:
         if fov is None:
             return {"solved": False, "ms": None, "status": "needs the field"}
         top = 255.0 if array.dtype == np.uint8 else max(float(array.max()), 1.0)
-        Image.fromarray((array.astype(np.float32) * (255.0 / top)).astype(np.uint8)).save(self.png)
+        Image.fromarray((array.astype(np.float32) * (255.0 / top)).astype(np.uint8)).save(self.png, compress_level=1)
         tolerance = max(0.02, 2.0 * (sigma_px or 0.0) * fov / array.shape[1])
         begin = time.perf_counter()
         try:
