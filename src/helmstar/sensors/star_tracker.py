@@ -305,8 +305,8 @@ def centre_angles(camera: Camera, R_SN: np.ndarray) -> tuple[float, float, float
     px, py = v[0] - x * v[2], v[1] - y * v[2]
     _, _, xx, xy, yx, yy = _distorted(camera, x, y)
     dx, dy = xx * px + xy * py, yx * px + yy * py
-    roll = math.degrees(math.atan2(-dx, -dy)) % 360.0
-    return math.degrees(math.atan2(z[1], z[0])) % 360.0, math.degrees(math.asin(max(-1.0, min(1.0, z[2])))), roll
+    roll = _turn(math.degrees(math.atan2(-dx, -dy)))
+    return _turn(math.degrees(math.atan2(z[1], z[0]))), math.degrees(math.asin(max(-1.0, min(1.0, z[2])))), roll
 
 
 def _centre_of(camera: Camera) -> tuple[float, float]:
@@ -323,6 +323,12 @@ def _centre_of(camera: Camera) -> tuple[float, float]:
             if abs(dx) + abs(dy) <= 1e-15:
                 break
     return x, y
+
+
+def _turn(angle: float) -> float:
+    """In [0, 360) deg: a remainder of a tiny negative number is 360 itself."""
+    angle %= 360.0
+    return angle if angle < 360.0 else 0.0
 
 
 def _distorted(camera: Camera, x: float, y: float) -> tuple[float, ...]:

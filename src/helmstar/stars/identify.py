@@ -130,7 +130,7 @@ def identify_stated(
         return found
     fov = 2.0 * float(np.arctan(0.5 * camera.size_px[0] / camera.focal_px))
     others = {key: value for key, value in others.items() if key != "focal_sigma"}
-    low, high = fov * (1.0 - MISSTATED), min(fov * (1.0 + MISSTATED), 0.99 * np.pi)
+    low, high = fov * (1.0 - MISSTATED), min(fov / (1.0 - MISSTATED), 0.99 * np.pi)
     second = identify(
         xy_px, camera, fov_range=(low, high), limit=limit / STATED_ODDS, work=min(work, RETRY_WORK), **others
     )

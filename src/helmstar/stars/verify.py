@@ -34,6 +34,8 @@ ZERO_POINT_RANGE = 10.0
 LOG_FACTORIAL = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1.0, 400.0)))])
 HARMONIC = np.concatenate([[1.0], np.cumsum(1.0 / np.arange(1.0, 400.0))])
 SO3_VOLUME = 8.0 * np.pi**2
+LEAST_PROBABILITY = 1e-99
+"""Below this a probability is a figure of the model, not of the world."""
 HOPELESS = -14.0
 """Log odds after the first step below which a hypothesis is dropped."""
 SCALES = (1.8, 3.2)
@@ -376,11 +378,11 @@ def fit_volumes(information: np.ndarray, freedom: Freedom, volume: float = SO3_V
 
 
 def probability_false(fits: list[Fit]) -> float:
-    """Posterior probability that the best of the fits is not the true one: all false, or another fit."""
+    """Posterior probability that the best of the fits is not the true one: all false, or another fit; never quite zero."""
     odds = np.array([fit.log_odds for fit in fits])
     top = odds.max()
     others = np.exp(-top) + np.exp(np.sort(odds)[:-1] - top).sum()
-    return float(others / (1.0 + others))
+    return float(max(others / (1.0 + others), LEAST_PROBABILITY))
 
 
 __all__ = ["Detections", "Fit", "Freedom", "probability_false", "verify"]
