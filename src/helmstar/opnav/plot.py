@@ -63,7 +63,7 @@ def draw(image: Image, scene: Any, found: FigureCentre, path: Path) -> Path:
         ("centre of figure", CENTRE),
         ("brightness centroid", CENTROID),
         ("outline of the figure", OUTLINE),
-        ("limb", LIMB),
+        *([("limb", LIMB)] if len(found.limb_px) else []),
     )
     for k, (name, colour) in enumerate(legend):
         pen.text((8, shape[1] - 16 * (len(legend) - k) - 4), name, fill=colour)
