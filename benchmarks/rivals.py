@@ -379,7 +379,7 @@ def main() -> None:
     parser.add_argument("--frames", type=Path, metavar="FOLDER")
     parser.add_argument("--lost", type=Path, metavar="FOLDER")
     parser.add_argument("--scenes", type=positive, default=100)
-    parser.add_argument("--empty", type=positive, default=50, metavar="N", help="lists of each size in part random")
+    parser.add_argument("--empty", type=positive, default=30, metavar="N", help="lists of each size in part random")
     parser.add_argument("--fields", type=float, nargs="+", default=[12.0, 20.0], metavar="DEG", help="of part lists")
     parser.add_argument("--rendered", type=positive, default=20, metavar="N")
     parser.add_argument("--timeout", type=float, default=1.0, metavar="S")
