@@ -325,6 +325,58 @@ def test_a_gate_refuses_and_gives_way_in_the_end():
         np.testing.assert_array_equal(after.log_weights, belief.log_weights)
 
 
+def test_what_a_gate_refuses_does_not_move_the_literal_filter():
+    """Refused or absent: the draw is the same, from the prediction, and so are its weights."""
+    filter = UnscentedParticleFilter(R2, threshold=0.0, least=0.0)
+    model = Model(R2, Process(_step, Noise(_wide, 2), None), MODEL.sensors)
+    belief = start_unscented_particles(R2, UNSCENTED, 20, KEY, model.process, jnp.zeros(()))
+    belief, _ = filter.predict(belief, model.process, jnp.zeros(()), jnp.ones(()))
+    refused, info = _far(filter, belief, 50.0, chi_square_gate(1e-6, max_dof=4, reopen_after=2))
+    assert info.status == GATED
+    absent, info = _update(
+        filter, belief, Measurement(jnp.array([np.nan]), jnp.zeros(()), jnp.array([False])), no_gate(4)
+    )
+    assert info.status == ABSENT
+    np.testing.assert_allclose(refused.points, absent.points, rtol=1e-12)
+    np.testing.assert_allclose(refused.log_weights, absent.log_weights, atol=1e-9)
+
+
+def test_a_component_that_is_no_number_spoils_nothing():
+    belief = grid_split(R2, START, 5, KEY, jnp.array([1.0, 0.0]))
+    c = belief.components
+    spoilt = Mixture(Gaussian(c.mean.at[0].set(jnp.nan), c.cov), belief.log_weights, KEY, belief.effective)
+    _, log = normalised(belief.log_weights.at[0].set(-jnp.inf))
+    rest = Mixture(c, belief.log_weights.at[0].set(-jnp.inf) - log, KEY, belief.effective)
+    found, expected = (mixture_moments(R2, _far(MixtureFilter(EKF), b, 0.5)[0]) for b in (spoilt, rest))
+    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-12)
+    np.testing.assert_allclose(found.cov, expected.cov, rtol=1e-12)
+
+
+@pytest.mark.parametrize("base", [EKF, UKF])
+@pytest.mark.parametrize("importance", [False, True])
+def test_a_drawn_state_without_process_noise_keeps_kalmans_answer(base, importance):
+    """Its variance stays zero, so that covariances are singular: first in order, where a Cholesky factor divides by it."""
+    model = Model(R2, Process(_still, Noise(_one_noise, 2), None), MODEL.sensors)
+    start = START if base is EKF else UNSCENTED
+    exact, _ = _track(EKF, START, lambda b: b, model)
+    belief = kernel_split(R2, start, 4000, KEY, jnp.eye(2)[:, :1], 0.0)
+    found, infos = _track(
+        MixtureFilter(base, sampled=(0,), importance=importance), belief, partial(mixture_moments, R2), model
+    )
+    assert DEGENERATE not in infos.status
+    sigma = np.sqrt(np.diagonal(exact.cov, axis1=1, axis2=2))
+    assert np.max(np.abs(found.mean - exact.mean) / sigma) < 0.06
+    np.testing.assert_allclose(found.cov, exact.cov, atol=0.06)
+
+
+def _still(params, x, u, dt, w):
+    return jnp.array([[1.0, 0.0], [-0.2, 0.9]]) @ x + w
+
+
+def _one_noise(params, x, u, dt):
+    return jnp.diag(jnp.array([0.0, 0.05]))
+
+
 def test_an_absent_measurement_leaves_everything():
     belief = grid_split(R2, START, 5, KEY, jnp.array([1.0, 0.0]))
     m = Measurement(jnp.array([jnp.nan]), jnp.zeros(()), jnp.array([False]))
@@ -399,3 +451,14 @@ def test_gamma_noise_is_what_its_density_says():
     assert noise.logpdf(p, x, None, dt, jnp.array([-3.01 * scale, 0, 0, 0, 0, 0])) == -jnp.inf
     moved = model.process.step(p, x, None, dt, jnp.array(w[0]))
     np.testing.assert_allclose(log_transition(model.retraction, model.process, x, None, dt, moved), log[0], rtol=1e-4)
+
+
+def test_gaussian_noise_where_the_truth_is_gaussian():
+    model = relative_model(MOTION, CAMERA, gamma=False)
+    x, _ = _state(0)
+    noise, p, dt = model.process.noise, model.process.params, jnp.asarray(10.0)
+    w = jnp.array([-25.0, 4.0, 30.0, 1e-5, -2e-5, 0.0])  # -25 m: below the Gamma's support
+    expected = stats.norm(0.0, 10.0).logpdf(w[:3]).sum() + stats.norm(0.0, 7e-6 * np.sqrt(10.0)).logpdf(w[3:]).sum()
+    moved = model.process.step(p, x, None, dt, w)
+    np.testing.assert_allclose(log_transition(model.retraction, model.process, x, None, dt, moved), expected, rtol=1e-4)
+    assert noise.sample is None  # then drawn by the covariance

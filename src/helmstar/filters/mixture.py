@@ -38,8 +38,9 @@ from ..core import Gate, Gaussian, Info, Measurement, Mixture, Process, Sensor, 
 from ..geometry import small
 from ..geometry.retraction import Retraction
 from .ekf import carry_covariance
-from .particle import judged, log_likelihood, mean_of, root_of, spread_of
+from .particle import judged, log_likelihood, mean_of, pooled, root_of, spread_of
 from .resampling import Scheme, draw, effective_number, normalised, take
+from .ukf import root_with_zeros, without_zeros
 
 Array = jax.Array
 
@@ -49,6 +50,7 @@ def mixture_moments(retraction: Retraction, belief: Mixture) -> Gaussian:
     w, c = jnp.exp(belief.log_weights), belief.components
     mean, d = mean_of(retraction, c.mean, belief.log_weights)
     covs = jax.vmap(lambda x, d, P: carry_covariance(retraction, "transport", x, -d, P))(c.mean, d, c.cov)
+    covs = jnp.where(w[:, None, None] > 0.0, covs, 0.0)
     return Gaussian(mean, jnp.tensordot(w, covs, 1) + spread_of(d, belief.log_weights))
 
 
@@ -56,13 +58,8 @@ def directions_part(P: Array, along: Array, share: Array) -> Array:
     """The part (dim, dim) of a covariance P that is `share` of the variance of the directions `along` (dim, k), with all that
     is correlated with them: share (P A) (A^T P A)^-1 (P A)^T. What is left is a covariance, in which these directions keep
     1 - share of their variance."""
-    PA = P @ along
-    root = root_of(along.T @ PA)
-    # The pseudo-inverse of a triangular root: directions without variance take nothing.
-    live = jnp.diagonal(root) > 0.0
-    safe = jnp.where(live[:, None] & live[None, :], root, jnp.eye(root.shape[0]))
-    B = small.solve_lower(safe, jnp.where(live[:, None], PA.T, 0.0))
-    return share * B.T @ B
+    B = _columns(P, along, share)
+    return B @ B.T
 
 
 def kernel_split(
@@ -71,14 +68,13 @@ def kernel_split(
     """n components drawn from one Gaussian belief: along `along` (dim, k) their means are spread and each keeps `kernel`^2 of
     the variance. The means are stratified (Latin hypercube), so that every part of the prior has its kernels."""
     ours, order, rest = jax.random.split(key, 3)
-    P_d = directions_part(start.cov, along, 1.0 - jnp.asarray(kernel) ** 2)
     k = along.shape[1]
     ranks = jax.vmap(lambda key: jax.random.permutation(key, n))(jax.random.split(order, k)).T
     normal = jax.scipy.special.ndtri((ranks + jax.random.uniform(ours, (n, k))) / n)
     # Columns that carry the drawn part, in terms of the k directions' own standard normals.
     B = _columns(start.cov, along, 1.0 - jnp.asarray(kernel) ** 2)
     means = jax.vmap(lambda d: retraction.boxplus(start.mean, d))(normal @ B.T)
-    return _components(start, means, start.cov - P_d, n, rest)
+    return _components(start, means, start.cov - B @ B.T, n, rest)
 
 
 def grid_split(retraction: Retraction, start: Any, n: int, key: Array, direction: Array, reach: float = 3.5) -> Mixture:
@@ -100,6 +96,7 @@ def _columns(P: Array, along: Array, share: Array | float) -> Array:
     """B (dim, k) with B B^T = directions_part(P, along, share)."""
     PA = P @ along
     root = root_of(along.T @ PA)
+    # The pseudo-inverse of a triangular root: directions without variance take nothing.
     live = jnp.diagonal(root) > 0.0
     safe = jnp.where(live[:, None] & live[None, :], root, jnp.eye(root.shape[0]))
     return jnp.sqrt(share) * small.solve_lower(safe, jnp.where(live[:, None], PA.T, 0.0)).T
@@ -160,12 +157,7 @@ class MixtureFilter:
             )
         log_weights, evidence = normalised(belief.log_weights + logs)
         effective = effective_number(log_weights)
-        w = jnp.exp(belief.log_weights)
-        centre = w @ infos.residual
-        S = jnp.tensordot(w, infos.S, 1) + spread_of(infos.residual - centre, belief.log_weights)
-        rows = jnp.repeat(m.mask, centre.shape[0] // m.mask.shape[0], total_repeat_length=centre.shape[0])
-        eye = jnp.eye(centre.shape[0])
-        S = jnp.where(rows[:, None] & rows[None, :], S, eye)
+        centre, S, rows = pooled(infos, belief.log_weights, m.mask)
         info, used = judged(evidence, effective, self.least, centre, S, rows, gate, refused)
 
         def choose(new: Any, old: Any) -> Any:
@@ -190,9 +182,11 @@ class MixtureFilter:
         """Log mean of p(z | x) N(x; before) / N(x; after) over two x drawn from `after`, opposite to each other: what is odd in
         the sensor's curvature drops out of it, and the mean over draws is the evidence all the same."""
         r = self.retraction
-        root, wide = small.cholesky(after.cov), small.cholesky(before.cov)
+        # States without variance (drawn, and without noise since) stay where they are, and count in neither density.
+        root = root_with_zeros(after.cov)
+        wide = without_zeros(root_with_zeros(before.cov))
         normal = jax.random.normal(key, (r.dim,))
-        log_det = jnp.sum(jnp.log(jnp.diagonal(root))) - jnp.sum(jnp.log(jnp.diagonal(wide)))
+        log_det = jnp.sum(jnp.log(jnp.diagonal(without_zeros(root)))) - jnp.sum(jnp.log(jnp.diagonal(wide)))
 
         def weight(normal: Array) -> Array:
             x = r.boxplus(after.mean, small.matvec(root, normal))
@@ -200,7 +194,7 @@ class MixtureFilter:
             return (
                 log_likelihood(sensor, x, m)[0]
                 - 0.5 * jnp.sum(white * white)
-                + 0.5 * jnp.sum(normal * normal)
+                + 0.5 * jnp.sum(jnp.where(jnp.diagonal(root) > 0.0, normal * normal, 0.0))
                 + log_det
             )
 

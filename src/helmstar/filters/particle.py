@@ -44,9 +44,14 @@ def mean_of(retraction: Retraction, points: Any, log_weights: Array) -> tuple[An
     w = jnp.exp(log_weights)
     mean = take(points, jnp.argmax(log_weights))
     for _ in range(2):
-        d = jax.vmap(lambda x, m=mean: retraction.boxminus(x, m))(points)
-        mean = retraction.boxplus(mean, w @ d)
-    return mean, jax.vmap(lambda x: retraction.boxminus(x, mean))(points)
+        mean = retraction.boxplus(mean, w @ _deviations(retraction, points, mean, w))
+    return mean, _deviations(retraction, points, mean, w)
+
+
+def _deviations(retraction: Retraction, points: Any, mean: Any, w: Array) -> Array:
+    """(n, dim), zero where a point has no weight: what is not finite there spoils nothing."""
+    d = jax.vmap(lambda x: retraction.boxminus(x, mean))(points)
+    return jnp.where(w[:, None] > 0.0, d, 0.0)
 
 
 def moments(retraction: Retraction, belief: Particles) -> Gaussian:
@@ -111,6 +116,19 @@ def judged(
     status = jnp.where(dof > 0, status, ABSENT)
     used = explained & (status != GATED) & (status != ABSENT)
     return Info(residual=e, S=S, nis=nis, dof=dof, loglik=evidence, status=status), used
+
+
+def pooled(infos: Info, log_weights: Array, mask: Array) -> tuple[Array, Array, Array]:
+    """Residual (m,), its covariance (m, m) and the rows present, of filters (leading axis of `infos`) weighted before they saw
+    the measurement."""
+    live = jnp.exp(log_weights) > 0.0
+    w, m = jnp.exp(log_weights), infos.residual.shape[1]
+    residuals = jnp.where(live[:, None], infos.residual, 0.0)
+    centre = w @ residuals
+    covs = jnp.where(live[:, None, None], infos.S, 0.0)
+    S = jnp.tensordot(w, covs, 1) + spread_of(residuals - centre, log_weights)
+    rows = jnp.repeat(mask, m // mask.shape[0], total_repeat_length=m)
+    return centre, jnp.where(rows[:, None] & rows[None, :], S, jnp.eye(m)), rows
 
 
 def start_particles(retraction: Retraction, start: Gaussian, n: int, key: Array) -> Particles:

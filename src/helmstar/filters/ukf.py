@@ -92,9 +92,9 @@ class UnscentedKalmanFilter:
         r, x, P = self.retraction, belief.mean, belief.cov
         n, q = r.dim, process.noise.dim
         distance, _, centre_cov, w = belief.spread.weights(n + q)
-        root = _root(P)  # states that were drawn (see mixture.py) have no variance
+        root = root_with_zeros(P)  # states that were drawn (see mixture.py) have no variance
         xi = _points(root, distance)
-        noise = _points(_root(process.noise.cov(process.params, x, u, dt)), distance)
+        noise = _points(root_with_zeros(process.noise.cov(process.params, x, u, dt)), distance)
         zero_w, zero_x = jnp.zeros(q, P.dtype), jnp.zeros(n, P.dtype)
         base = process.step(process.params, x, u, dt, zero_w)
 
@@ -113,7 +113,7 @@ class UnscentedKalmanFilter:
         d_x, d_w, d_0 = deviations(mean)
         cov = _weighted_outer(w, d_x, d_x) + _weighted_outer(w, d_w, d_w) + centre_cov * d_0[:, None] * d_0[None, :]
         cross = _weighted_outer(w, d_x, xi)
-        V = small.invert_lower(_without_zeros(root))
+        V = small.invert_lower(without_zeros(root))
         F = small.matmul(small.matmul(cross, small.transpose(V)), V)
         return UnscentedBelief(mean, cov, belief.spread), Predicted(mean, cov, F)
 
@@ -125,7 +125,7 @@ class UnscentedKalmanFilter:
         distance, _, centre_cov, w = belief.spread.weights(r.dim)
         e, rows, R = prepare(sensor, x, m)
         z_0 = sensor.predict(sensor.params, x, m.a)
-        xi = _points(small.cholesky(P), distance)
+        xi = _points(root_with_zeros(P), distance)
         dz = jax.vmap(lambda d: sensor.minus(sensor.predict(sensor.params, r.boxplus(x, d), m.a), z_0))(xi)
         dz = jnp.where(rows[None, :], dz, jnp.zeros_like(dz))
         dz_mean = w * jnp.sum(dz, axis=0)
@@ -143,14 +143,14 @@ class UnscentedKalmanFilter:
         return UnscentedBelief(r.boxplus(x, d), cov, belief.spread), info
 
 
-def _without_zeros(L: Array) -> Array:
+def without_zeros(L: Array) -> Array:
     """A root with a unit diagonal where it has none, so that it can be inverted."""
     eye = jnp.eye(L.shape[0], dtype=L.dtype)
     return jnp.where((jnp.diagonal(L) == 0.0)[:, None], eye, L)
 
 
-def _root(Q: Array) -> Array:
-    """Cholesky factor of a covariance that may have zero variances (a noise that is switched off)."""
+def root_with_zeros(Q: Array) -> Array:
+    """Cholesky factor of a covariance that may have zero variances (a noise that is switched off, a state that was drawn)."""
     off = jnp.diagonal(Q) <= 0.0
     eye = jnp.eye(Q.shape[0], dtype=Q.dtype)
     L = small.cholesky(jnp.where(off[:, None] | off[None, :], eye, Q))

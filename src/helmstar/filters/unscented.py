@@ -18,10 +18,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..backend import jax, jnp
-from ..core import Gate, Gaussian, Info, Measurement, Process, Sensor, no_gate, pytree
+from ..core import GATED, Gate, Gaussian, Info, Measurement, Process, Sensor, no_gate, pytree
 from ..geometry import small
 from ..geometry.retraction import Retraction
-from .particle import judged, log_likelihood, log_normal, mean_of, root_of, spread_of
+from .particle import judged, log_likelihood, log_normal, mean_of, pooled, root_of, spread_of
 from .resampling import Scheme, draw, effective_number, normalised, take
 from .ukf import Spread, UnscentedBelief, UnscentedKalmanFilter
 
@@ -101,24 +101,32 @@ class UnscentedParticleFilter:
         open_gate, zero = no_gate(gate.limits.shape[0] - 1), jnp.zeros((), dtype=int)
         normals = jax.random.normal(ours, (n, r.dim))
 
-        def one(x: Any, P: Array, before: Any, normal: Array) -> tuple[Any, Array, Array, Info]:
-            b, info = base.update(UnscentedBelief(x, P, belief.spread), sensor, m, open_gate, zero)
-            root = small.cholesky(b.cov)
-            point = r.boxplus(b.mean, small.matvec(root, normal))
+        def own(x: Any, P: Array) -> tuple[UnscentedBelief, Info]:
+            return base.update(UnscentedBelief(x, P, belief.spread), sensor, m, open_gate, zero)
+
+        updated, infos = jax.vmap(own)(belief.points, belief.covs)
+        centre, S, rows = pooled(infos, belief.log_weights, m.mask)
+        # Whether the gate lets the measurement pass does not depend on the draw that follows.
+        passed, _ = judged(jnp.zeros(()), jnp.asarray(jnp.inf), self.least, centre, S, rows, gate, refused)
+        taken = passed.status != GATED
+        proposals = jax.tree.map(
+            lambda new, old: jnp.where(taken, new, old), (updated.mean, updated.cov), (belief.points, belief.covs)
+        )
+
+        def one(mean: Any, P: Array, before: Any, normal: Array) -> tuple[Any, Array]:
+            root = small.cholesky(P)
+            point = r.boxplus(mean, small.matvec(root, normal))
             proposal = log_normal(normal, jnp.sum(jnp.log(jnp.diagonal(root))), r.dim)
             transition = log_transition(r, belief.process, before, belief.u, belief.dt, point)
-            return point, b.cov, log_likelihood(sensor, point, m)[0] + transition - proposal, info
+            return point, jnp.where(taken, log_likelihood(sensor, point, m)[0], 0.0) + transition - proposal
 
-        points, covs, logs, infos = jax.vmap(one)(belief.points, belief.covs, belief.before, normals)
+        # The points are moved whatever happens: where nothing is measured, or the gate refuses it, the draw is from the
+        # prediction and its weight the transition's over the prediction's.
+        points, logs = jax.vmap(one)(*proposals, belief.before, normals)
+        covs = proposals[1]
         log_weights, evidence = normalised(belief.log_weights + logs)
         effective = effective_number(log_weights)
-        w = jnp.exp(belief.log_weights)
-        centre = w @ infos.residual
-        S = jnp.tensordot(w, infos.S, 1) + spread_of(infos.residual - centre, belief.log_weights)
-        rows = jnp.repeat(m.mask, centre.shape[0] // m.mask.shape[0], total_repeat_length=centre.shape[0])
-        S = jnp.where(rows[:, None] & rows[None, :], S, jnp.eye(centre.shape[0]))
         info, _ = judged(evidence, effective, self.least, centre, S, rows, gate, refused)
-        # The points are moved whatever happens: without a measurement the draw is from the prediction, and its weight is even.
         anew = effective <= self.threshold * n
         indices = jnp.where(anew, draw(again_key, log_weights, self.resampling), jnp.arange(n))
         log_weights = jnp.where(anew, -jnp.log(n), log_weights)

@@ -185,6 +185,7 @@ def _pixel_cov(p: Camera, x: Any, a: Sight) -> Array:
 _SIX = Noise(_noise_cov, 6, _noise_sample, _noise_logpdf)
 _SEVEN = Noise(_noise_cov, 7, _noise_sample)
 _THREE = Noise(_noise_cov, 3, _noise_sample, _noise_logpdf)
+_GAUSSIAN = {n: Noise(_noise_cov, n) for n in (3, 6, 7)}
 
 
 def body_camera(camera: Camera) -> Sensor:
@@ -192,8 +193,9 @@ def body_camera(camera: Camera) -> Sensor:
     return Sensor(pixel_line, _minus, _pixel_cov, camera)
 
 
-def relative_model(motion: Motion, camera: Camera, state: type = PositionPointing) -> Model:
-    """Model of one of the four states. Raises KeyError for another."""
+def relative_model(motion: Motion, camera: Camera, state: type = PositionPointing, gamma: bool = True) -> Model:
+    """Model of one of the four states. gamma: whether the position's noise is Gamma less its mean; else it is Gaussian. Raises
+    KeyError for another state."""
     retraction = {
         PositionVelocity: position_velocity,
         PositionPointing: position_pointing,
@@ -201,5 +203,7 @@ def relative_model(motion: Motion, camera: Camera, state: type = PositionPointin
         PositionPointingOffset: position_pointing_offset,
     }[state]
     noise = {PositionVelocity: _THREE, PositionPointingOffset: _SEVEN}.get(state, _SIX)
+    if not gamma:
+        noise = _GAUSSIAN[noise.dim]
     jacobian = _jacobian_six if state is PositionPointing else None
     return Model(retraction, Process(_step, noise, motion, jacobian), (body_camera(camera),))

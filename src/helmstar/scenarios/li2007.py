@@ -251,9 +251,7 @@ class Experiment:
         true = np.einsum("...ij,...j->...i", R_CB, Rotation.from_quat(q.reshape(-1, 4)).apply(sun).reshape(r.shape))
         known = R_CB @ Rotation.from_quat(self.q_ref).apply(sun)
         lights = take_frames(self.spec, np.asarray(data.z), np.linalg.norm(r, axis=-1), true, known, workers)
-        change = np.abs(np.diff(lights.phase, axis=1, prepend=lights.phase[:, :1]))
-        # From frame to frame with nothing seen between there is no phase to compare with.
-        change = np.where(lights.seen & np.roll(lights.seen, 1, axis=1), change, 0.0)
+        change = phase_changes(lights.phase, lights.seen)
         values: Any = (lights.z, lights.cov, lights.offset, self.spec.body.offset_walk_rad * change, lights.seen)
         return Pictures(*values)
 
@@ -274,7 +272,7 @@ class Experiment:
             direction = np.concatenate([along, np.zeros(len(P0) - 3)])
             values = _numbers(P0, self.q_ref, self.v, direction, self.spec.seed)
             prior = Prior(*values, spread=spread, kernel=_numbers(t.kernel)[0])
-            model = relative_model(motion, self.camera, state)
+            model = relative_model(motion, self.camera, state, self.spec.truth.noise == "gamma")
             static = {"filter": filter, "kind": kind, "n": n, "state": state, "corrected": corrected}
             return Call(estimate, (model, prior, _numbers(self.spec.step_s)[0]), static)
 
@@ -294,7 +292,7 @@ class Experiment:
             "rpf": call("particles", BootstrapFilter(r, regularised=True), points, usual),
             "upf_printed": call("literal", UnscentedParticleFilter(r), kernels, printed),
             "upf": call("kernels", MixtureFilter(narrow, importance=True, threshold=0.1), kernels, usual),
-            "rbpf": call("points", MixtureFilter(ekf(), sampled=(main,), threshold=0.5), kernels, usual),
+            "rbpf": call("points", MixtureFilter(ekf(), sampled=(main,), threshold=0.5, least=2.0), kernels, usual),
             "gsf": call("grid", MixtureFilter(ekf()), t.components, usual),
             "batch": call("batch", None, t.batch_iterations, usual),
             "ekf_position_velocity": call("gaussian", ekf(PositionVelocity), 0, usual, PositionVelocity),
@@ -365,6 +363,14 @@ class Experiment:
         from .li2007_results import claims
 
         return claims(self.spec, dataset, summary)
+
+
+def phase_changes(phase: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Change of phase (runs, steps), rad, of each frame since the last that was seen; 0 for the first and for those not seen."""
+    last = np.maximum.accumulate(np.where(seen, np.arange(phase.shape[1]), -1), axis=1)
+    before = np.concatenate([np.full((len(phase), 1), -1), last[:, :-1]], axis=1)
+    change = np.abs(phase - np.take_along_axis(phase, np.maximum(before, 0), axis=1))
+    return np.where(seen & (before >= 0), change, 0.0)
 
 
 def _numbers(*values: Any) -> tuple[Any, ...]:
