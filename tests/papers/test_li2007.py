@@ -6,11 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray
 
 from helmstar.campaign.engine import Engine
 from helmstar.core import DEGENERATE
 from helmstar.evaluate.paired import paired_difference
 from helmstar.imaging.body.phase import lambert_factor
+from helmstar.scenarios.li2007 import phase_changes
+from helmstar.scenarios.li2007_results import _better
 from helmstar.scenarios.specification import build, load, parse_set
 
 LAST = slice(114, 120)  # t = 1150..1200 s
@@ -102,6 +105,37 @@ def test_the_unscented_particle_filter_is_the_gaussian_sums_equal():
     assert np.linalg.norm(found["upf"]["position_error_km"][:, LAST], axis=-1).max() < 5.0
     assert 0.6 < found["upf"]["nees_per_state"].mean() < 1.4  # 20 runs, correlated in time
     assert found["upf"]["effective"].min() > 2.0
+
+
+def test_filters_know_what_kind_of_noise_there_is():
+    densities = [
+        _experiment(f"truth.noise={kind}").estimators["upf_printed"].arguments[0].process.noise.logpdf
+        for kind in ("gamma", "gaussian")
+    ]
+    assert densities[0] is not None
+    assert densities[1] is None
+
+
+def test_better_is_surely_better_in_pairs():
+    """Not by a mean that the draws explain, and not by leaving out the runs that end in no number."""
+    rng = np.random.default_rng(0)
+    base = np.abs(rng.normal(40.0, 10.0, (30, 5, 3)))
+    errors = {"b": base, "better": base - 2.0 + 0.1 * rng.standard_normal(base.shape), "chance": base[::-1] - 0.1}
+    errors["broken"] = np.where(np.arange(30)[:, None, None] == 3, np.nan, errors["better"])
+    stacked = np.stack(list(errors.values()))
+    dataset = xarray.Dataset(
+        {"position_error_km": (("estimator", "run", "time", "axis"), stacked)}, {"estimator": list(errors)}
+    )
+    assert {n: _better(dataset, n, "b") for n in errors} == {
+        "b": False, "better": True, "chance": False, "broken": False,
+    }  # fmt: skip
+
+
+def test_a_change_of_phase_counts_from_the_last_frame_that_was_seen():
+    phase = np.array([[1.0, 0.0, 0.0, 0.5, 0.4]])
+    seen = np.array([[True, False, False, True, True]])
+    np.testing.assert_allclose(phase_changes(phase, seen), [[0.0, 0.0, 0.0, 0.5, 0.1]], atol=1e-15)
+    np.testing.assert_array_equal(phase_changes(phase, ~np.ones_like(seen)), np.zeros((1, 5)))
 
 
 def test_pixels_in_the_loop_and_what_an_uncorrected_centroid_costs(tmp_path, monkeypatch):

@@ -152,7 +152,7 @@ def add_bounds(page: Page, dataset: xarray.Dataset, campaign: Campaign) -> None:
         short="Bound",
     )
     page.figure(
-        charts, "RMS over the runs, and the Cramér-Rao bound of position with unknown pointing.",
+        charts, "RMS over the runs, and the Cramér-Rao bound of position with unknown pointing, for centres seen directly.",
         alt="RMS position error against time, one line for each estimator, with the bound.", height=460, select="Axis",
         selected="x", group="axis",
     )  # fmt: skip
