@@ -183,10 +183,15 @@ class MixtureFilter:
         the sensor's curvature drops out of it, and the mean over draws is the evidence all the same."""
         r = self.retraction
         # States without variance (drawn, and without noise since) stay where they are, and count in neither density.
-        root = root_with_zeros(after.cov)
-        wide = without_zeros(root_with_zeros(before.cov))
+        # Only where states are drawn: the guards cost a tenth of the filter's time.
+        factor = root_with_zeros if self.sampled else small.cholesky
+        root, wide = factor(after.cov), factor(before.cov)
+        live = jnp.diagonal(root) > 0.0
+        if self.sampled:
+            wide = without_zeros(wide)
+        log_dets = jnp.log(jnp.diagonal(root)) - jnp.log(jnp.diagonal(wide))
+        log_det = jnp.sum(jnp.where(live, log_dets, 0.0))
         normal = jax.random.normal(key, (r.dim,))
-        log_det = jnp.sum(jnp.log(jnp.diagonal(without_zeros(root)))) - jnp.sum(jnp.log(jnp.diagonal(wide)))
 
         def weight(normal: Array) -> Array:
             x = r.boxplus(after.mean, small.matvec(root, normal))
@@ -194,7 +199,7 @@ class MixtureFilter:
             return (
                 log_likelihood(sensor, x, m)[0]
                 - 0.5 * jnp.sum(white * white)
-                + 0.5 * jnp.sum(jnp.where(jnp.diagonal(root) > 0.0, normal * normal, 0.0))
+                + 0.5 * jnp.sum(jnp.where(live, normal * normal, 0.0))
                 + log_det
             )
 

@@ -109,7 +109,7 @@ class UnscentedParticleFilter:
         # Whether the gate lets the measurement pass does not depend on the draw that follows.
         passed, _ = judged(jnp.zeros(()), jnp.asarray(jnp.inf), self.least, centre, S, rows, gate, refused)
         taken = passed.status != GATED
-        proposals = jax.tree.map(
+        means, covs = jax.tree.map(
             lambda new, old: jnp.where(taken, new, old), (updated.mean, updated.cov), (belief.points, belief.covs)
         )
 
@@ -122,8 +122,7 @@ class UnscentedParticleFilter:
 
         # The points are moved whatever happens: where nothing is measured, or the gate refuses it, the draw is from the
         # prediction and its weight the transition's over the prediction's.
-        points, logs = jax.vmap(one)(*proposals, belief.before, normals)
-        covs = proposals[1]
+        points, logs = jax.vmap(one)(means, covs, belief.before, normals)
         log_weights, evidence = normalised(belief.log_weights + logs)
         effective = effective_number(log_weights)
         info, _ = judged(evidence, effective, self.least, centre, S, rows, gate, refused)
