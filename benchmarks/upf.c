@@ -1,6 +1,6 @@
 /* The scalar reference: the unscented particle filter of li2007 with kernels, one run after the other. The same equations as
- * helmstar's MixtureFilter over an UnscentedKalmanFilter with linear prediction and importance weights: state r (3), attitude
- * q (4) with its error on the right; kappa form by `scale` = alpha^2 (6 + kappa), weights as given.
+ * helmstar's MixtureFilter over an UnscentedKalmanFilter with linear prediction and importance weights at two opposite draws,
+ * but kernels are never drawn anew: state r (3), attitude q (4) with its error on the right; kappa form by `scale` = alpha^2 (6 + kappa), weights as given.
  *
  * run(runs, steps, n, ...): z (runs, steps, 2); R_CB (runs, steps, 3, 3); start (runs, 3); mean_out (runs, steps, 3).
  */
@@ -97,27 +97,30 @@ static double update(const Sensor *s, const double R_CB[9], const double *z, Ker
         for (int m = 0; m < 2; m++) K[i][m] = C[0][i] * I[0][m] + C[1][i] * I[1][m];
         d[i] = K[i][0] * e[0] + K[i][1] * e[1];
     }
-    double after[D][D], root[D][D], noise[D], x[D];
+    double after[D][D], root[D][D], noise[D], logs[2];
     for (int i = 0; i < D; i++)
         for (int j = 0; j < D; j++) after[i][j] = k->P[i][j] - K[i][0] * C[0][j] - K[i][1] * C[1][j];
-    double after_det = cholesky(after, root), own = 0.0, prior = 0.0;
+    double after_det = cholesky(after, root), own = 0.0;
     for (int i = 0; i < D; i++) { noise[i] = normal(); own += noise[i] * noise[i]; }
-    for (int i = 0; i < D; i++) {
-        x[i] = d[i];
-        for (int j = 0; j <= i; j++) x[i] += root[i][j] * noise[j];
+    for (int sign = 0; sign < 2; sign++) {
+        double x[D], white[D], h[2], prior = 0.0, far = 0.0;
+        for (int i = 0; i < D; i++) {
+            x[i] = d[i];
+            for (int j = 0; j <= i; j++) x[i] += (sign ? -root[i][j] : root[i][j]) * noise[j];
+        }
+        for (int i = 0; i < D; i++) {
+            white[i] = x[i];
+            for (int j = 0; j < i; j++) white[i] -= L[i][j] * white[j];
+            white[i] /= L[i][i];
+            prior += white[i] * white[i];
+        }
+        move(k, x, r, q);
+        pixel(s, R_CB, r, q, h);
+        for (int m = 0; m < 2; m++) far += (z[m] - h[m]) * (z[m] - h[m]) / (s->sigma * s->sigma);
+        logs[sign] = -0.5 * (far + prior - own) - before_det + after_det;
     }
-    double white[D];
-    for (int i = 0; i < D; i++) {
-        white[i] = x[i];
-        for (int j = 0; j < i; j++) white[i] -= L[i][j] * white[j];
-        white[i] /= L[i][i];
-        prior += white[i] * white[i];
-    }
-    double h[2], far = 0.0;
-    move(k, x, r, q);
-    pixel(s, R_CB, r, q, h);
-    for (int m = 0; m < 2; m++) far += (z[m] - h[m]) * (z[m] - h[m]) / (s->sigma * s->sigma);
-    double log_weight = -0.5 * (far + prior - own) - before_det + after_det;
+    double high = logs[0] > logs[1] ? logs[0] : logs[1];
+    double log_weight = high + log(0.5 * (exp(logs[0] - high) + exp(logs[1] - high)));
     move(k, d, r, q);
     memcpy(k->r, r, sizeof r);
     memcpy(k->q, q, sizeof q);
