@@ -10,6 +10,7 @@ import xarray
 
 from helmstar.campaign.engine import Engine
 from helmstar.core import DEGENERATE
+from helmstar.errors import ConfigurationError
 from helmstar.evaluate.paired import paired_difference
 from helmstar.imaging.body.phase import lambert_factor
 from helmstar.scenarios.li2007 import phase_changes
@@ -129,6 +130,18 @@ def test_better_is_surely_better_in_pairs():
     assert {n: _better(dataset, n, "b") for n in errors} == {
         "b": False, "better": True, "chance": False, "broken": False,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("keys", "text"),
+    [
+        (("truth.noise_km=1e9", "camera.sigma_px=1e-4"), "sigma_px"),
+        (("camera.level=image", "camera.cross_px=[5.0,0.0]"), "cross terms"),
+    ],
+)
+def test_what_cannot_be_computed_is_refused_before_it_runs(keys, text):
+    with pytest.raises(ConfigurationError, match=text):
+        _experiment(*keys)
 
 
 def test_a_change_of_phase_counts_from_the_last_frame_that_was_seen():

@@ -43,6 +43,9 @@ def headline(summary: dict[str, Any]) -> tuple[str, ...]:
     )
     lost = [f"`{n}` ({e['diverged']})" for n, e in est.items() if e["diverged"]]
     more = f"Runs that end more than 5 km off: {', '.join(lost)}." if lost else "No run of any estimator diverges."
+    absent = m.get("absent_share") or 0.0
+    if absent:
+        more += f" In {100 * absent:.2g}% of the frames there is nothing to measure: dark, outside the field or cut by its edge."
     return first, more
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..backend import jax, jnp
 from ..core import Gaussian, Measurement, Model, no_gate, pytree
+from ..errors import ConfigurationError
 from ..evaluate import recursive_bound
 from ..filters import (
     BootstrapFilter,
@@ -236,6 +237,7 @@ class Experiment:
         self.from_images = spec.camera.level == "image"
         if self.from_images:
             self.simulate = Call(simulate_from_images, (setting, self._pictures(setting, workers)))
+        _ = self.bound  # so that numbers without an answer are refused before anything runs
         self.estimators = self._estimators()
 
     def _pictures(self, setting: Setting, workers: int) -> Pictures:
@@ -291,7 +293,7 @@ class Experiment:
             "pf": call("particles", BootstrapFilter(r), points, usual),
             "rpf": call("particles", BootstrapFilter(r, regularised=True), points, usual),
             "upf_printed": call("literal", UnscentedParticleFilter(r), kernels, printed),
-            "upf": call("kernels", MixtureFilter(narrow, importance=True, threshold=0.1), kernels, usual),
+            "upf": call("kernels", MixtureFilter(narrow, importance=True, threshold=0.1, least=2.0), kernels, usual),
             "rbpf": call("points", MixtureFilter(ekf(), sampled=(main,), threshold=0.5, least=2.0), kernels, usual),
             "gsf": call("grid", MixtureFilter(ekf()), t.components, usual),
             "batch": call("batch", None, t.batch_iterations, usual),
@@ -323,7 +325,13 @@ class Experiment:
         H = np.concatenate([-across / rho, -turn], axis=2)
         weight = (self.spec.camera.focal_px / self.spec.camera.sigma_px) ** 2
         Q = np.diag(np.repeat([self.sigma_r**2, self.sigma_q**2 * dt], 3))
-        return recursive_bound(np.eye(6), Q, weight * H.transpose(0, 2, 1) @ H, np.diag(self.P0))
+        try:
+            return recursive_bound(np.eye(6), Q, weight * H.transpose(0, 2, 1) @ H, np.diag(self.P0))
+        except np.linalg.LinAlgError:
+            raise ConfigurationError(
+                "truth.noise_km, prior or camera: what the frames tell and what is known before differ by more than numbers "
+                "have digits; bring truth.noise_km, prior.position_km, camera.focal_mm or camera.sigma_px nearer to their defaults"
+            ) from None
 
     def _line(self) -> np.ndarray:
         """r0 + v t (updates, 3), m."""

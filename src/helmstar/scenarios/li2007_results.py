@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core import DEGENERATE
+from ..core import ABSENT, DEGENERATE
 from ..evaluate.paired import paired_difference
 
 if TYPE_CHECKING:
@@ -68,6 +68,7 @@ def summarise(dataset: Any) -> dict[str, dict]:
                 "nees_per_state_median": finite(np.median(d["nees_per_state"].values)),
                 "diverged": int(np.sum(~(off <= DIVERGED_KM))),
                 "degenerate_share": finite(np.mean(d["status"].values == DEGENERATE)),
+                "absent_share": finite(np.mean(d["status"].values == ABSENT)),
                 "rms_error_km": {
                     t: _axes(np.sqrt((d["position_error_km"].values[:, k] ** 2).mean(axis=0))) for t, k in at.items()
                 },

@@ -139,6 +139,14 @@ class Specification(ScenarioSpecification):
         )
 
     @model_validator(mode="after")
+    def _frames_have_no_cross_terms(self) -> Specification:
+        if self.camera.level == "image" and any(self.camera.cross_px):
+            raise ValueError(
+                "camera.cross_px: frames are rendered without cross terms; use [0, 0] or camera.level = pixel"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _does_not_hit(self) -> Specification:
         r, v = np.array(self.truth.position_km), np.array(self.truth.velocity_km_s)
         t = np.clip(-(r @ v) / (v @ v), 0.0, self.updates * self.step_s)
