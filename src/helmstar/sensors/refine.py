@@ -38,7 +38,7 @@ HUBER = 2.5
 """Residuals (of two coordinates, over sigma) beyond which a star pulls no more."""
 GATE = 4.0
 """Residuals of matches over sigma, what the fit does not know yet included."""
-MAGNITUDE_GATE = 2.5
+MAGNITUDE_GATE = 2.0
 """Difference of magnitudes beyond which a star and a detection do not match."""
 STILL_PX = 0.03
 """Steps that move no star farther are the last: what the linear problem leaves is of their second order."""
@@ -105,19 +105,21 @@ class Refined:
 
 
 def refine(
-    found: Identification, centroids: Centroids, camera: Camera, sky: Sky, prior: LensPrior, epoch_years: float = 0.0
-) -> Refined:
+    found: Identification, centroids: Centroids, camera: Camera, sky: Sky, prior: LensPrior, epoch_years: float = 0.0,
+    magnitude: np.ndarray | None = None, magnitude_gate: float = MAGNITUDE_GATE,
+) -> Refined:  # fmt: skip
     """Fit attitude and lens to all stars that match, from a solved identification.
 
-    camera: as the identification took it. epoch_years: 1 sigma of the time between the sky's year and the image. Where fewer
-    than three stars match, the identification stays as it is.
+    camera: as the identification took it. epoch_years: 1 sigma of the time between the sky's year and the image.
+    magnitude: (n,) of the centroids, that of their flux by default. Where fewer than three stars match, the identification stays as it is.
     """
     lens = _Lens.of(camera, prior)
     R, p = matrix_of_quaternion(found.q_SN), np.array([np.log(found.focal_px / camera.focal_px), 0.0, 0.0, 0.0])
-    magnitude = -2.5 * np.log10(np.maximum(centroids.flux, 1e-12))
+    if magnitude is None:
+        magnitude = -2.5 * np.log10(np.maximum(centroids.flux, 1e-12))
     zero = middle(sky.magnitude[found.stars] - magnitude[found.detections])
     near = _in_view(sky, R, camera, found.focal_px)
-    near = near[sky.magnitude[near] < zero + float(magnitude.max()) + MAGNITUDE_GATE]
+    near = near[sky.magnitude[near] < zero + float(magnitude.max()) + magnitude_gate]
     at = np.minimum(np.searchsorted(near, found.stars), len(near) - 1)
     good = near[at] == found.stars if len(near) else np.zeros(len(at), bool)
     i, j = at[good], found.detections[good]
@@ -126,16 +128,19 @@ def refine(
     xy, C = centroids.xy_px, centroids.covariance_px
     drift = epoch_years * found.focal_px * np.hypot(sky.catalog.pm_ra[near], sky.catalog.pm_dec[near])
     spread = lambda i, j: C[j] + drift[i, None, None] ** 2 * lens.round  # noqa: E731
-    agree = np.abs(sky.magnitude[near][:, None] - magnitude - zero) < MAGNITUDE_GATE
+    agree = np.abs(sky.magnitude[near][:, None] - magnitude - zero) < magnitude_gate
+    density = len(xy) / (camera.width * camera.height)
     d_N, best, residual = sky.directions[near], None, np.zeros((0, 2))
     for _ in range(_STEPS):
         predicted, J = lens.predict(R, p, d_N)
         best = None if best is None else replace(best, delta=np.zeros(7))
         best = _settle(J[i], xy[j] - predicted[i], spread(i, j), lens.prior(p), 2 if best is None else 1, best)
         for _ in range(_MATCHINGS):
-            k, m = _matched(predicted + best.moved(J), J, best, xy, C, drift, agree)
+            k, m, gain = _matched(predicted + best.moved(J), J, best, xy, C, drift, agree, density)
+            few = len(k) < max(_LEAST, len(i) // 2)
+            k, m = (v[: _depth(gain, k, len(xy))] for v in (k, m))
             same = len(k) == len(i) and bool((k == i).all() and (m == j).all())
-            if same or len(k) < max(_LEAST, len(i) // 2):
+            if same or few or len(k) < _LEAST:
                 break
             i, j = k, m
             best = _settle(J[i], xy[j] - predicted[i], spread(i, j), lens.prior(p), 2, best)
@@ -304,8 +309,10 @@ def _matched(
     C: np.ndarray,
     drift: np.ndarray,
     agree: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Stars and detections (k,), (k,) that are each other's nearest within the gate and agree (stars, detections)."""
+    density: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stars and detections (k,), (k,) that are each other's nearest within the gate and agree (stars, detections), brightest
+    star first, and the log (k,) of how much likelier each is so than by chance. density: 1/px^2, of detections."""
     A = J.reshape(-1, 7)
     sigma2 = fit.scale**2 * 0.5 * (C[:, 0, 0] + C[:, 1, 1])
     doubt2 = 0.5 * ((A @ fit.covariance) * A).sum(axis=1).reshape(-1, 2).sum(axis=1) + drift**2
@@ -313,8 +320,26 @@ def _matched(
     apart[~agree | (apart > GATE**2 * (sigma2 + doubt2[:, None]))] = np.inf
     j = apart.argmin(axis=1)
     rows = np.arange(len(apart))
-    good = np.isfinite(apart[rows, j]) & (apart.argmin(axis=0)[j] == rows)
-    return rows[good], j[good]
+    good = np.flatnonzero(np.isfinite(apart[rows, j]) & (apart.argmin(axis=0)[j] == rows))
+    j = j[good]
+    variance = sigma2[j] + doubt2[good]
+    gain = -0.5 * apart[good, j] / variance - np.log(2.0 * np.pi * variance * density)
+    return good, j, gain
+
+
+def _depth(gain: np.ndarray, rank: np.ndarray, count: int) -> int:
+    """How many of the matches, brightest first, belong to the depth that an image of `count` detections most probably has.
+
+    Of the S brightest stars k are matched, at any share: k! (S - k)!/(S + 1)! of it, and 1/S of S (`stars.verify`). Beyond, where
+    few of many stars have a match, the matches are those that chance gives. gain: (m,); rank: (m,) of the star.
+    """
+    if len(gain) == 0:
+        return 0
+    k, S = np.arange(1, len(gain) + 1), rank + 1
+    factorial = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1.0, S[-1] + 2.0)))])
+    vacancy = np.cumsum(np.log((count + 1.0) / (count + 1.0 - k)))
+    total = np.cumsum(gain) + vacancy + factorial[k] + factorial[S - k] - factorial[S + 1] - np.log(S)
+    return int(total.argmax()) + 1
 
 
 __all__ = ["EPOCH_SPREAD_YEARS", "LensPrior", "Refined", "refine"]

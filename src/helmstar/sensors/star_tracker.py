@@ -23,8 +23,9 @@ from ..imaging import Camera, Centroids, DetectionSettings, Image
 from ..imaging.calibrated import Calibrated
 from ..imaging.detect import Optics, detect_near, detect_next
 from ..stars.catalog import Catalog, load_catalog
+from ..stars.doubt import Doubt, identify_uncalibrated, magnitude_of_order, roughened
 from ..stars.glance import follow, glance
-from ..stars.identify import LIMIT, Identification, identify, identify_stated, matrix_of_quaternion, unit_quaternion
+from ..stars.identify import LIMIT, Identification, identify, matrix_of_quaternion, unit_quaternion
 from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
 from ..stars.track import WIDEST_PX, track
@@ -45,7 +46,7 @@ class StarSolution:
     """What became of an image. camera: with the focal length and k1 that were found; ms: milliseconds by stage; ra_deg, dec_deg:
     the direction at the image's geometric centre, roll_deg: north's angle from image up there, counter-clockwise; NaN
     where it is not solved. sigma_arcsec (3,): about x, y and z of S. scale: factor on the centroids' sigmas that the residuals
-    show and that the covariance holds."""
+    show and that the covariance holds. doubt: what had to be doubted for it (`stars.doubt`)."""
 
     identification: Identification
     centroids: Centroids
@@ -56,6 +57,7 @@ class StarSolution:
     sigma_arcsec: np.ndarray
     ms: dict[str, float]
     scale: float = 1.0
+    doubt: Doubt = ""
 
     @property
     def status(self) -> str:
@@ -194,44 +196,42 @@ class StarTracker:
             None if prior_q_SN is None or prior_sigma is None or fov_range is not None else (prior_q_SN, prior_sigma)
         )
         seen = (centroids.xy_px + 0.5, centroids.flux, centroids.covariance_px, eye, self.sky, focal_sigma, self.limit)
-        found = None
+        found, doubt = None, ""
         if prior is not None:
             found = follow(*seen, *prior, self.q_SB)
         elif fov_range is None:
             found = glance(*seen, self.q_SB)
-        if found is not None:
-            pass
-        elif prior is not None:
-            found = track(
-                centroids.xy_px + 0.5, eye, *prior, flux=centroids.flux,
-                sigma_px=centroids.covariance_px, focal_sigma=focal_sigma, q_SB=self.q_SB, sky=self.sky, limit=self.limit,
-                fall_back=fall_back,
-            )  # fmt: skip
-        elif self.camera is None and fov_range is None:
-            found = identify_stated(
-                centroids.xy_px + 0.5, eye, flux=centroids.flux, sigma_px=centroids.covariance_px,
-                focal_sigma=focal_sigma, q_SB=self.q_SB, sky=self.sky, limit=self.limit,
-            )  # fmt: skip
-            if found.solved and abs(found.focal_px / camera.focal_px - 1.0) > 5.0 * focal_sigma:
-                fov_range = (0.0, math.pi)  # the statement was wrong: the fit must not lean on it
-        else:
-            found = identify(
-                centroids.xy_px + 0.5, eye, flux=centroids.flux, sigma_px=centroids.covariance_px, fov_range=fov_range,
-                focal_sigma=focal_sigma, q_SB=self.q_SB, sky=self.sky, limit=self.limit,
-            )  # fmt: skip
+        stars = {
+            "flux": centroids.flux, "sigma_px": centroids.covariance_px, "focal_sigma": focal_sigma, "q_SB": self.q_SB,
+            "sky": self.sky, "limit": self.limit,
+        }  # fmt: skip
+        if found is None and prior is not None:
+            calibrated = self.camera is not None
+            found = track(centroids.xy_px + 0.5, eye, *prior, fall_back=fall_back and calibrated, **stars)
+            if not found.solved and fall_back and not calibrated:
+                found = None
+        if found is None and self.camera is not None:
+            found = identify(centroids.xy_px + 0.5, eye, **stars)
+        elif found is None:
+            found, doubt = identify_uncalibrated(centroids.xy_px + 0.5, eye, fov_range=fov_range, **stars)
         done = time.perf_counter()
         scale = 1.0
         if found.solved:
             if self.known is not None:
                 lens = LensPrior.calibrated(self.known)
-            else:
-                lens = LensPrior.uncalibrated(camera, math.inf if fov_range is not None else focal_sigma)
-            refined = refine(found, centroids, camera, self.sky, lens, self.epoch_years)
+            else:  # where the statement was wrong, the fit must not lean on it
+                unknown = fov_range is not None or doubt == "field"
+                lens = LensPrior.uncalibrated(camera, math.inf if unknown else focal_sigma)
+            places, magnitude = centroids, None
+            if doubt == "rough":
+                C = roughened(centroids.covariance_px, len(centroids), width)
+                places, magnitude = replace(centroids, covariance_px=C), magnitude_of_order(centroids.flux)
+            refined = refine(found, places, camera, self.sky, lens, self.epoch_years, magnitude)
             found, camera, scale = refined.identification, refined.camera, refined.scale
         end = time.perf_counter()
         ms = {**(ms or {}), "identify": 1e3 * (done - begin), "refine": 1e3 * (end - done)}
         ms["total"] = sum(ms.values())
-        return _solution(found, centroids, camera, ms, scale)
+        return _solution(found, centroids, camera, ms, scale, doubt)
 
     def _honest(self, centroids: Centroids) -> Centroids:
         """With the covariances that the calibration found."""
@@ -283,14 +283,15 @@ def _sky(year: float, velocity_c: tuple[float, ...] | None, position_au: tuple[f
 
 
 def _solution(
-    found: Identification, centroids: Centroids, camera: Camera, ms: dict[str, float], scale: float
-) -> StarSolution:
+    found: Identification, centroids: Centroids, camera: Camera, ms: dict[str, float], scale: float,
+    doubt: Doubt,
+) -> StarSolution:  # fmt: skip
     nan = float("nan")
     if not found.solved:
-        return StarSolution(found, centroids, camera, nan, nan, nan, np.full(3, nan), ms)
+        return StarSolution(found, centroids, camera, nan, nan, nan, np.full(3, nan), ms, doubt=doubt)
     ra, dec, roll = centre_angles(camera, matrix_of_quaternion(found.q_SN))
     sigma = np.degrees(np.sqrt(np.diagonal(found.covariance))) * 3600.0
-    return StarSolution(found, centroids, camera, ra, dec, roll, sigma, ms, scale)
+    return StarSolution(found, centroids, camera, ra, dec, roll, sigma, ms, scale, doubt)
 
 
 def centre_angles(camera: Camera, R_SN: np.ndarray) -> tuple[float, float, float]:

@@ -4,7 +4,8 @@ For lists of centroids as plain arrays; docs/stars.md says how it works. No JAX 
 """
 
 from .catalog import Catalog, load_catalog
-from .identify import Identification, default_sky, identify, identify_stated
+from .doubt import Doubted, identify_uncalibrated
+from .identify import Identification, default_sky, identify
 from .patterns import Sky
 from .pinhole import Camera, Pinhole
 from .track import track
@@ -12,12 +13,13 @@ from .track import track
 __all__ = [
     "Camera",
     "Catalog",
+    "Doubted",
     "Identification",
     "Pinhole",
     "Sky",
     "default_sky",
     "identify",
-    "identify_stated",
+    "identify_uncalibrated",
     "load_catalog",
     "track",
 ]

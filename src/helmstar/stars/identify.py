@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
@@ -28,8 +28,6 @@ KEPT = 5
 """Hypotheses of each chunk that are screened."""
 DEPTHS = ((BRIGHTEST, 1.0), (BRIGHT, 1.0), (FAINT, 0.15))
 """Pair tables with how probable it is that they lead to a solution which the others miss. The first is for unknown fields."""
-MISSTATED, STATED_ODDS, RETRY_WORK = 0.1, 10.0, 800_000
-"""How wrong a stated field may be, relatively, the odds against its being wrong at all, and the catalogue pairs this is worth."""
 WORTH = tuple(4e-8 * 2.0**k for k in range(8, -1, -1))
 """Solutions that a look at one more catalogue pair must promise, from first to last (`hypotheses.Stage`)."""
 WORK = 2_200_000
@@ -117,30 +115,6 @@ def identify(
         return unsolved("too few stars", 0)
     fits, done = search(sky, d, freedom, fewest, limit, work)
     return conclude(sky, d, covariances, freedom, fits, done, fewest, limit, q_SB)
-
-
-def identify_stated(
-    xy_px: np.ndarray, camera: Camera, *, limit: float = LIMIT, work: int = WORK, **others
-) -> Identification:
-    """As `identify`, for a field of view that someone stated: where that fails, fields up to MISSTATED wider or narrower are
-    searched, at odds of one to STATED_ODDS that the statement is that wrong. others: of `identify`, without fov_range.
-    """
-    found = identify(xy_px, camera, limit=limit, work=work, **others)
-    if found.solved or found.status == "too few stars":
-        return found
-    fov = 2.0 * float(np.arctan(0.5 * camera.size_px[0] / camera.focal_px))
-    others = {key: value for key, value in others.items() if key != "focal_sigma"}
-    low, high = fov * (1.0 - MISSTATED), min(fov / (1.0 - MISSTATED), 0.99 * np.pi)
-    second = identify(
-        xy_px, camera, fov_range=(low, high), limit=limit / STATED_ODDS, work=min(work, RETRY_WORK), **others
-    )
-    second = replace(
-        second,
-        probability_false=min(1.0, STATED_ODDS * second.probability_false),
-        log_odds=second.log_odds - float(np.log(STATED_ODDS)),
-        work=found.work + second.work,
-    )
-    return second if second.solved or second.log_odds > found.log_odds else replace(found, work=second.work)
 
 
 def prepare(
@@ -423,4 +397,4 @@ def unsolved(status: Status, done: int, p_false: float = 1.0, odds: float = -np.
     )
 
 
-__all__ = ["Identification", "default_sky", "identify", "identify_stated"]
+__all__ = ["Identification", "default_sky", "identify"]

@@ -14,6 +14,7 @@ from ..imaging.calibrate import DEFAULT, Calibration, Matches, calibrate
 from ..imaging.calibrated import Calibrated
 from ..sensors.refine import LensPrior, lens_sigmas, refine
 from ..sensors.star_tracker import StarSolution, StarTracker
+from ..stars.doubt import magnitude_of_order
 from ..stars.identify import matrix_of_quaternion
 
 SIMPLER = (DEFAULT, ("focal", "cx", "cy", "k1"), ("focal", "k1"), ("focal",))
@@ -156,7 +157,9 @@ def _match_again(
         C = noise[0] ** 2 * f.centroids.covariance_px + noise[1] ** 2 * np.eye(2)
         i = replace(f.found.identification, q_SN=q, q_BN=q, focal_px=camera.focal_px)
         stars = replace(f.centroids, covariance_px=C)
-        better = refine(i, stars, camera, tracker.sky, prior, tracker.epoch_years).identification
+        # The brightness of a frame is read as it was when the frame was solved.
+        magnitude = magnitude_of_order(stars.flux) if f.found.doubt == "rough" else None
+        better = refine(i, stars, camera, tracker.sky, prior, tracker.epoch_years, magnitude).identification
         if len(better.stars) >= 3:
             f.found = replace(f.found, identification=better, camera=camera)
     again = tracker.with_camera(known)

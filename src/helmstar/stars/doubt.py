@@ -1,0 +1,117 @@
+"""What if a camera is not as it was told: its field misstated, its lens bent, its brightness no measure of light?
+
+`identify` believes what it is given. Of a camera that nobody calibrated three things are often wrong: the stated field; the
+places, which a lens or a smeared, saturated star displaces by pixels where noise alone would do so by tenths; and the fluxes,
+which a camera's gamma, a clipped background or saturation bend until only their order is left. What is told is tried first; where
+that fails, each doubt is tried at odds against it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from .identify import LIMIT, WORK, Identification, identify
+from .pinhole import Camera
+
+Doubt = Literal["", "rough", "field"]
+
+ODDS = 10.0
+"""Against each doubt."""
+MISSTATED = 0.1
+"""How wrong a stated field may be, relatively."""
+FIELD_WORK, ROUGH_WORK = 800_000, 800_000
+"""Catalogue pairs that the doubts are worth."""
+ROUGH_WIDTHS = 0.0015
+"""1 sigma of a place that lens or smear displaced, per axis, over the image's width."""
+ORDER_SIGMA = 0.5
+"""1 sigma, mag, of V minus the magnitude that the order tells (`magnitude_of_order`)."""
+COUNTS = 0.5
+"""Stars brighter than V grow as 10 to this times V: Hipparcos has 0.48 to 0.52 from V = 2 to 7."""
+
+
+class Doubted(NamedTuple):
+    """identification, and the doubt under which it holds: '' none, 'rough' (places to some pixels, brightness by its order), or
+    'field' (the stated one is wrong)."""
+
+    identification: Identification
+    doubt: Doubt
+
+
+def magnitude_of_order(flux: np.ndarray) -> np.ndarray:
+    """(n,) magnitudes that stars of a sky would have by the order of their fluxes (n,), whatever the response to light.
+
+    The k-th brightest of a field is expected at log10(k)/COUNTS and a constant. False and missing stars, where they come at
+    every brightness, change the constant only.
+    """
+    flux = np.asarray(flux, dtype=float)
+    rank = np.empty(len(flux))
+    rank[np.argsort(-flux, kind="stable")] = np.arange(1, len(flux) + 1)
+    return np.where(np.isfinite(flux), np.log10(rank) / COUNTS, np.nan)
+
+
+def roughened(sigma_px: float | np.ndarray, count: int, width: int) -> np.ndarray:
+    """Covariances (count, 2, 2) px^2 of places that lens or smear displaced; sigma_px as for `identify`."""
+    sigma = np.asarray(sigma_px, dtype=float)
+    square = np.eye(2)
+    own = sigma if sigma.ndim == 3 else np.broadcast_to(sigma**2, (count,))[:, None, None] * square
+    return own + (ROUGH_WIDTHS * width) ** 2 * square
+
+
+def identify_uncalibrated(
+    xy_px: np.ndarray,
+    camera: Camera,
+    *,
+    flux: np.ndarray | None = None,
+    magnitude: np.ndarray | None = None,
+    sigma_px: float | np.ndarray = 0.5,
+    fov_range: tuple[float, float] | None = None,
+    focal_sigma: float = 0.005,
+    limit: float = LIMIT,
+    work: int = WORK,
+    **others,
+) -> Doubted:
+    """As `identify`, for a camera that nobody calibrated; what is told is believed first, then doubted.
+
+    A stated field is searched up to MISSTATED wider and narrower in the end; a range of fields is believed. others: of
+    `identify`.
+    """
+    xy_px, told = np.asarray(xy_px, dtype=float), {"flux": flux, "magnitude": magnitude, "sigma_px": sigma_px, **others}
+    lens = {"fov_range": fov_range, "focal_sigma": focal_sigma}
+    found = identify(xy_px, camera, limit=limit, work=work, **lens, **told)
+    best = Doubted(found, "")
+    if found.solved or found.status == "too few stars":
+        return best
+    bright = flux if flux is not None else None if magnitude is None else -np.asarray(magnitude, dtype=float)
+    rough = {
+        **others,
+        "magnitude": None if bright is None else magnitude_of_order(bright),
+        "magnitude_sigma": ORDER_SIGMA,
+        "zero_point": None,
+        "sigma_px": roughened(sigma_px, len(xy_px), camera.size_px[0]),
+    }
+    best = _likelier(best, "rough", identify(xy_px, camera, limit=limit / ODDS, work=min(work, ROUGH_WORK), **lens, **rough))
+    if best.identification.solved or fov_range is not None:
+        return best
+    fov = 2.0 * float(np.arctan(0.5 * camera.size_px[0] / camera.focal_px))
+    lens = {"fov_range": (fov * (1.0 - MISSTATED), min(fov / (1.0 - MISSTATED), 0.99 * np.pi))}
+    return _likelier(best, "field", identify(xy_px, camera, limit=limit / ODDS, work=min(work, FIELD_WORK), **lens, **told))
+
+
+def _likelier(first: Doubted, doubt: Doubt, b: Identification) -> Doubted:
+    """The second, at ODDS against it, where it is solved or the likelier of two that are not; with the work of both."""
+    a = first.identification
+    b = replace(
+        b,
+        probability_false=min(1.0, ODDS * b.probability_false),
+        log_odds=b.log_odds - float(np.log(ODDS)),
+        work=a.work + b.work,
+    )
+    if b.solved or b.log_odds > a.log_odds:
+        return Doubted(b, doubt)
+    return Doubted(replace(a, work=b.work), first.doubt)
+
+
+__all__ = ["Doubt", "Doubted", "identify_uncalibrated", "magnitude_of_order", "roughened"]
