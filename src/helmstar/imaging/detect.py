@@ -23,6 +23,7 @@ _BRIGHT = 15.0
 _MISFIT = 1.5  # chi-square per pixel above which the model, not noise, is what is wrong
 _COARSE = 1.8  # px; optics broader than this need the coarsest level
 _FEW = 6  # stars; fewer do not confirm what is believed of the optics
+_FILLS, _WELL = 0.85, 0.8  # widest sigma, over half the window, of a star that explains so much of it
 _FULL = 9  # px
 _SAME = 0.2  # of the logarithm of the width
 _FOR_WIDTH = 24  # stars whose widths tell the optics
@@ -390,10 +391,12 @@ def _is_star(f: Fit, noise: np.ndarray, half: int, s: DetectionSettings) -> np.n
     wide, narrow = f.sigma.max(axis=1), f.sigma.min(axis=1)
     light = np.einsum("nij,nij->n", f.model, f.model)
     explained = light / (light + np.einsum("nij,nij->n", f.residual, f.residual))
+    # At the coarsest level nothing wider is tried: a smeared or badly focused star may fill the window if little else does.
+    wider = (wide < _FILLS * half) & (explained > _WELL) if half == HALF[-1] else False
     return (
         (f.flux > 0.6 * s.threshold * noise * np.sqrt(4 * np.pi * wide * narrow))
         & (np.maximum(np.abs(f.x), np.abs(f.y)) < 0.6 * half)
-        & (wide < 0.6 * half)
+        & ((wide < 0.6 * half) | wider)
         & (explained > 0.4)
     )
 

@@ -65,6 +65,12 @@ class LensPrior:
         return cls(focal, 0.02 * camera.width, 0.01 / corner**2)
 
     @classmethod
+    def rough(cls, camera: Camera, focal: float) -> LensPrior:
+        """Of a lens that displaces stars by pixels: a decentred one, centred within 10%, and 3% of distortion in the corner."""
+        usual = cls.uncalibrated(camera, focal)
+        return cls(focal, 5.0 * usual.centre_px, 3.0 * usual.k1)
+
+    @classmethod
     def calibrated(cls, known: Calibrated) -> LensPrior:
         """As the calibration says; a camera written by hand is believed to 0.05% of its focal length, 0.2% of its width, and 0.1%
         of distortion in the corner. A focal length follows the temperature: never better than 0.01%."""
@@ -110,7 +116,7 @@ def refine(
 ) -> Refined:  # fmt: skip
     """Fit attitude and lens to all stars that match, from a solved identification.
 
-    camera: as the identification took it. epoch_years: 1 sigma of the time between the sky's year and the image.
+    camera: as the identification took it. epoch_years: 1 sigma of the time from the sky's year to the image.
     magnitude: (n,) of the centroids, that of their flux by default. Where fewer than three stars match, the identification stays as it is.
     """
     lens = _Lens.of(camera, prior)

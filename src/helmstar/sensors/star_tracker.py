@@ -29,12 +29,14 @@ from ..stars.identify import LIMIT, Identification, identify, matrix_of_quaterni
 from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
 from ..stars.track import WIDEST_PX, track
-from .refine import EPOCH_SPREAD_YEARS, LensPrior, refine
+from .refine import EPOCH_SPREAD_YEARS, LensPrior, Refined, refine
 
 FOCAL_SIGMA = 0.005
 """1 sigma, relative, of a focal length that stands for a stated field of view."""
 CALIBRATED_SIGMA = 0.0005
 """The same of a calibrated camera."""
+ROUGH_SCALE = 1.5
+"""Factor on the centroids' sigmas from which a fit says that the lens displaces stars, not noise."""
 TRACKED = 50
 """Stars whose windows are looked at in tracking."""
 AU_DAY = 149597870700.0 / 86400.0
@@ -217,21 +219,33 @@ class StarTracker:
         done = time.perf_counter()
         scale = 1.0
         if found.solved:
-            if self.known is not None:
-                lens = LensPrior.calibrated(self.known)
-            else:  # where the statement was wrong, the fit must not lean on it
-                unknown = fov_range is not None or doubt == "field"
-                lens = LensPrior.uncalibrated(camera, math.inf if unknown else focal_sigma)
-            places, magnitude = centroids, None
-            if doubt == "rough":
-                C = roughened(centroids.covariance_px, len(centroids), width)
-                places, magnitude = replace(centroids, covariance_px=C), magnitude_of_order(centroids.flux)
-            refined = refine(found, places, camera, self.sky, lens, self.epoch_years, magnitude)
+            refined, doubt = self._refined(
+                found, centroids, camera, focal_sigma if fov_range is None else math.inf, doubt
+            )
             found, camera, scale = refined.identification, refined.camera, refined.scale
         end = time.perf_counter()
         ms = {**(ms or {}), "identify": 1e3 * (done - begin), "refine": 1e3 * (end - done)}
         ms["total"] = sum(ms.values())
         return _solution(found, centroids, camera, ms, scale, doubt)
+
+    def _refined(
+        self, found: Identification, centroids: Centroids, camera: Camera, focal_sigma: float, doubt: Doubt
+    ) -> tuple[Refined, Doubt]:
+        """The last fit, within what is known of the lens, and what had to be doubted for it."""
+        if self.known is not None:
+            return refine(found, centroids, camera, self.sky, LensPrior.calibrated(self.known), self.epoch_years), doubt
+        if doubt == "field":  # the fit must not lean on a statement that was wrong
+            focal_sigma = math.inf
+        if doubt != "rough":
+            refined = refine(
+                found, centroids, camera, self.sky, LensPrior.uncalibrated(camera, focal_sigma), self.epoch_years
+            )
+            if refined.scale < ROUGH_SCALE:
+                return refined, doubt
+        rough = replace(centroids, covariance_px=roughened(centroids.covariance_px, len(centroids), camera.width))
+        magnitude = magnitude_of_order(centroids.flux)
+        lens = LensPrior.rough(camera, focal_sigma)
+        return refine(found, rough, camera, self.sky, lens, self.epoch_years, magnitude), "rough"
 
     def _honest(self, centroids: Centroids) -> Centroids:
         """With the covariances that the calibration found."""

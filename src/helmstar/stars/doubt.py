@@ -26,6 +26,8 @@ FIELD_WORK, ROUGH_WORK = 800_000, 800_000
 """Catalogue pairs that the doubts are worth."""
 ROUGH_WIDTHS = 0.0015
 """1 sigma of a place that lens or smear displaced, per axis, over the image's width."""
+BRIGHTEST_FEW = 25
+"""Detections that a rough camera is tried on first."""
 ORDER_SIGMA = 0.5
 """1 sigma, mag, of V minus the magnitude that the order tells (`magnitude_of_order`)."""
 COUNTS = 0.5
@@ -85,19 +87,24 @@ def identify_uncalibrated(
     if found.solved or found.status == "too few stars":
         return best
     bright = flux if flux is not None else None if magnitude is None else -np.asarray(magnitude, dtype=float)
-    rough = {
-        **others,
-        "magnitude": None if bright is None else magnitude_of_order(bright),
-        "magnitude_sigma": ORDER_SIGMA,
-        "zero_point": None,
-        "sigma_px": roughened(sigma_px, len(xy_px), camera.size_px[0]),
-    }
-    best = _likelier(best, "rough", identify(xy_px, camera, limit=limit / ODDS, work=min(work, ROUGH_WORK), **lens, **rough))
+    order = None if bright is None else magnitude_of_order(bright)
+    C = roughened(sigma_px, len(xy_px), camera.size_px[0])
+    # The brightest alone first: noise of a clipped sky makes many false stars, all of them faint.
+    for count in (BRIGHTEST_FEW, len(xy_px)):
+        few = np.arange(len(xy_px)) if order is None else np.argsort(order, kind="stable")[:count]
+        rough = {**others, "magnitude_sigma": ORDER_SIGMA, "zero_point": None, "sigma_px": C[few]}
+        rough |= {"magnitude": None if order is None else order[few], "limit": limit / ODDS}
+        second = identify(xy_px[few], camera, work=min(work, ROUGH_WORK), **lens, **rough)
+        best = _likelier(best, "rough", replace(second, detections=few[second.detections]))
+        if best.identification.solved or len(few) == len(xy_px):
+            break
     if best.identification.solved or fov_range is not None:
         return best
     fov = 2.0 * float(np.arctan(0.5 * camera.size_px[0] / camera.focal_px))
     lens = {"fov_range": (fov * (1.0 - MISSTATED), min(fov / (1.0 - MISSTATED), 0.99 * np.pi))}
-    return _likelier(best, "field", identify(xy_px, camera, limit=limit / ODDS, work=min(work, FIELD_WORK), **lens, **told))
+    return _likelier(
+        best, "field", identify(xy_px, camera, limit=limit / ODDS, work=min(work, FIELD_WORK), **lens, **told)
+    )
 
 
 def _likelier(first: Doubted, doubt: Doubt, b: Identification) -> Doubted:
