@@ -1,6 +1,7 @@
 """Builds the compiled kernels where a C compiler is at hand; without one helmstar computes the same with NumPy.
 
-All src/helmstar/**/*.c become one shared library, helmstar/_kernels.so, which helmstar.native opens. HELMSTAR_NATIVE=0 leaves it out.
+All src/helmstar/**/*.c become one shared library, helmstar/_kernels.so, which helmstar.native opens.
+HELMSTAR_NATIVE=0 leaves it out.
 """
 
 import os

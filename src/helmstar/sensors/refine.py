@@ -116,8 +116,8 @@ def refine(
 ) -> Refined:  # fmt: skip
     """Fit attitude and lens to all stars that match, from a solved identification.
 
-    camera: as the identification took it. epoch_years: 1 sigma of the time from the sky's year to the image.
-    magnitude: (n,) of the centroids, that of their flux by default. Where fewer than three stars match, the identification stays as it is.
+    camera: as the identification took it. epoch_years: 1 sigma of the time from the sky's year to the image. magnitude: (n,)
+    of the centroids, that of their flux by default. Where fewer than three stars match, the identification stays as it is.
     """
     lens = _Lens.of(camera, prior)
     R, p = matrix_of_quaternion(found.q_SN), np.array([np.log(found.focal_px / camera.focal_px), 0.0, 0.0, 0.0])

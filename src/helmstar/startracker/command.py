@@ -175,9 +175,15 @@ def entry_of(file: Path, found: StarSolution) -> dict[str, Any]:
         "stars": len(i.stars),
         "residual_rms_arcsec": float(i.residual_rms * ARCSEC_RAD),
         "hip": [int(v) for v in i.hip],
+        "message": DOUBTED[found.doubt],
     }
 
 
+DOUBTED = {
+    "": "",
+    "rough": "solved with a lens that displaces stars by pixels, brightness by its order alone: calibrate the camera",
+    "field": "solved with another field than --fov says",
+}
 REASON = {
     "solved": "",
     "too few stars": "fewer than three stars were detected; expose longer, or focus",
@@ -197,6 +203,7 @@ def print_solved(result: dict[str, Any]) -> None:
             f"{e['file']}: RA {e['ra_deg']:.5f} Dec {e['dec_deg']:+.5f} roll {e['roll_deg']:.4f} deg "
             f"(+- {cross:.2g}, roll {roll:.2g} arcsec), field {e['fov_deg']:.4f} deg, {e['stars']} stars, "
             f"residual {e['residual_rms_arcsec']:.3g} arcsec, false {e['probability_false']:.1g}, {e['ms_total']:.0f} ms"
+            + (f"; {e['message']}" if e["message"] else "")
         )
 
 
