@@ -98,7 +98,11 @@ def identify_uncalibrated(
         best = _likelier(best, "rough", replace(second, detections=few[second.detections]))
         if best.identification.solved or len(few) == len(xy_px):
             break
-    if best.identification.solved or fov_range is not None:
+    if fov_range is not None:
+        return best
+    # A rough camera fits a wrong field too, with a focal length that leans far out.
+    found = best.identification
+    if found.solved and abs(np.log(found.focal_px / camera.focal_px)) < 3.0 * focal_sigma:
         return best
     fov = 2.0 * float(np.arctan(0.5 * camera.size_px[0] / camera.focal_px))
     lens = {"fov_range": (fov * (1.0 - MISSTATED), min(fov / (1.0 - MISSTATED), 0.99 * np.pi))}
@@ -108,7 +112,7 @@ def identify_uncalibrated(
 
 
 def _likelier(first: Doubted, doubt: Doubt, b: Identification) -> Doubted:
-    """The second, at ODDS against it, where it is solved or the likelier of two that are not; with the work of both."""
+    """The second, at ODDS against it, where it is likelier and solved if the first is; with the work of both."""
     a = first.identification
     b = replace(
         b,
@@ -116,7 +120,7 @@ def _likelier(first: Doubted, doubt: Doubt, b: Identification) -> Doubted:
         log_odds=b.log_odds - float(np.log(ODDS)),
         work=a.work + b.work,
     )
-    if b.solved or b.log_odds > a.log_odds:
+    if b.log_odds > a.log_odds and (b.solved or not a.solved):
         return Doubted(b, doubt)
     return Doubted(replace(a, work=b.work), first.doubt)
 
