@@ -136,6 +136,18 @@ def test_saturated_and_smeared_stars():
     assert np.median(np.hypot(found.x_px[i] - truth.x_px[k], found.y_px[i] - truth.y_px[k])) < 0.1
 
 
+def test_stars_that_fill_the_coarsest_window():
+    """Badly focused and saturated, twenty pixels across: a camera out of focus still sees its brightest stars."""
+    e = Exposure(zero_point_e_s=4e7, psf_sigma_px=5.8)
+    hits, there = 0, 0
+    for seed in range(3):
+        image, truth = scene(10, seed, e, faint=4.0)
+        found = detect(image)
+        i, k = matched(found, truth, within=2.5)
+        hits, there = hits + len(set(k)), there + len(truth.x_px)
+    assert hits >= 0.9 * there
+
+
 @pytest.mark.parametrize("value", [0, 128, 255])
 def test_an_empty_sky_has_no_stars(value):
     assert len(detect(Image(np.full((300, 400), value, np.uint8), 255.0, 8))) == 0
