@@ -12,9 +12,14 @@ stars of the image. Pixels that are saturated or outside of the image are filled
 
 from __future__ import annotations
 
+from ctypes import c_double, c_int, c_int64, c_void_p
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
+
+from ..native import kernels
 
 ITERATIONS = 6
 MIN_SIGMA = 0.3
@@ -104,6 +109,11 @@ def fit(
 
     Single precision: with everything over the flux the numbers are about one, and pixels have no more digits.
     """
+    library = kernels()
+    if library is not None and len(windows):
+        found = _fit_compiled(library, windows, x, y, sky, noise, width, filled, tight, iterations)
+        if found is not None:
+            return found
     n, m, _ = windows.shape
     half = m // 2
     data = np.subtract(windows, sky[:, None, None], dtype=np.float32)
@@ -163,6 +173,29 @@ def fit(
     bread = np.linalg.inv(_normal(F, _prior(spread, flux, m)))
     p = p.astype(float)
     return Fit(p[:, 2], p[:, 3], p[:, 0], sky + p[:, 1], p[:, 4:], bread, light, rest, model)
+
+
+def _fit_compiled(
+    library: Any, windows: np.ndarray, x: np.ndarray, y: np.ndarray, sky: np.ndarray, noise: np.ndarray, width: np.ndarray,
+    filled: np.ndarray, tight: float, iterations: int,
+) -> Fit | None:  # fmt: skip
+    """The same by centroid.c; None for windows that it does not take."""
+    n, m, _ = windows.shape
+    given = [np.ascontiguousarray(a, np.float32) for a in (windows, x, y, sky, noise)]
+    given += [np.ascontiguousarray(filled, bool), np.ascontiguousarray(width, float)]
+    p, matrices, images = np.empty((n, 6)), np.empty((2, n, 6, 6), np.float32), np.empty((2, n, m, m), np.float32)
+    out = [a.ctypes.data for a in (p, *matrices, *images)]
+    given_at = [a.ctypes.data for a in given]
+    if _declared(library).helmstar_fit(*given_at[:6], n, m, given_at[6], tight, iterations, *out):
+        return None
+    return Fit(p[:, 2], p[:, 3], p[:, 0], sky + p[:, 1], p[:, 4:], *matrices, *images)
+
+
+@cache
+def _declared(library: Any) -> Any:
+    """The library with the types of what is called here."""
+    library.helmstar_fit.argtypes = [c_void_p] * 6 + [c_int64, c_int, c_void_p, c_double, c_int] + [c_void_p] * 5
+    return library
 
 
 def _model(F: np.ndarray, flux: np.ndarray) -> np.ndarray:
