@@ -8,11 +8,13 @@ needs only two of the detections to be real and in the table, and what it tolera
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..native import kernels
 from .patterns import EMPTY, FAINT, RUNG, SHORTEST, Level, Pairs, Sky, SkyMap
 from .verify import Detections, Freedom
 
@@ -30,6 +32,8 @@ FIELD_REACH = 0.70
 """Longest pairs of detections, over the field."""
 MAGNITUDES = np.where(np.arange(256) == EMPTY, 1e6, np.arange(256) * 0.05 - 2.0).astype(np.float32)
 """Of the sky map's values."""
+MOST_IN_C = 128
+"""Detections that hypotheses.c has room for."""
 SAMPLE = 40
 """Detection pairs from which the catalogue pairs per detection pair are estimated."""
 
@@ -145,13 +149,15 @@ def hypotheses(
     table = thinned(level.pairs(n), level.catalog.magnitude, d)
     first, count = _spans(table, d, pairs, freedom)
     total = np.cumsum(count)
+    library = kernels()
+    chunk_of = _chunk if library is None or len(d) > MOST_IN_C else _Compiled(library, level, table, d, freedom).chunk
     start = 0
     while start < len(pairs):
         done = total[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(total, done + chunk, side="right")))
         chunk = min(2 * chunk, CHUNK)
         s = slice(start, stop)
-        yield int(total[stop - 1] - done), _chunk(level, table, d, pairs[s], first[s], count[s], freedom, keep)
+        yield int(total[stop - 1] - done), chunk_of(level, table, d, pairs[s], first[s], count[s], freedom, keep)
         start = stop
 
 
@@ -282,8 +288,64 @@ def _rank(level: Level, d: Detections, i, j, a, b, zero, freedom: Freedom, keep:
         some = None if zero is None else zero[best]
         score[best] += _score(sky_map, d, M[:, best], i[best], j[best], some, slice(few, len(d)))
     best = best[_largest(score[best], keep)]
-    va, vb = (level.directions[k[best]] for k in (a, b))
-    return Hypotheses(rotations(d, i[best], j[best], f[best], va, vb), f[best], score[best])
+    return _chosen(level, d, i[best], j[best], a[best], b[best], f[best], score[best])
+
+
+def _chosen(level: Level, d: Detections, i, j, a, b, f, score) -> Hypotheses:
+    return Hypotheses(rotations(d, i, j, f, level.directions[a], level.directions[b]), f, score)
+
+
+_int, _int32, _float, _double = ctypes.c_int64, ctypes.c_int32, ctypes.c_float, ctypes.c_double
+
+
+def _at(x: np.ndarray | None) -> ctypes.c_void_p:
+    return ctypes.c_void_p(None if x is None else x.__array_interface__["data"][0])
+
+
+class _Compiled:
+    """What `_chunk` does, by hypotheses.c; all that a search's chunks share is made ready once."""
+
+    def __init__(self, library: ctypes.CDLL, level: Level, table: Pairs, d: Detections, freedom: Freedom):
+        self.candidates, self.best = library.helmstar_candidates, library.helmstar_best
+        self.candidates.restype = self.best.restype = ctypes.c_int64
+        self.stars = np.ascontiguousarray(level.rows, dtype=np.float32)
+        self.first, self.second = (np.ascontiguousarray(x, dtype=np.int32) for x in (table.first, table.second))
+        self.xy = np.ascontiguousarray(d.xy, dtype=float)
+        self.m = None if d.magnitude is None else np.ascontiguousarray(d.magnitude, dtype=np.float32)
+        self.mixed = mixed(len(d)).astype(np.int32)
+
+    def chunk(self, level: Level, table: Pairs, d: Detections, pairs, first, count, freedom: Freedom, keep: int):
+        room = 2 * int(count.sum())
+        if room == 0:
+            return None
+        pairs, first, count = (np.ascontiguousarray(x, dtype=np.int64) for x in (pairs, first, count))
+        ij, ab = np.empty((room, 2), dtype=np.int32), np.empty((room, 2), dtype=np.int32)
+        f, zero, score = np.empty(room), np.empty(room, dtype=np.float32), np.empty(room, dtype=np.float32)
+        n_stars, n = _int(len(self.stars)), len(d)
+        h = self.candidates(
+            n_stars, _at(self.stars), _int(len(self.first)), _at(self.first), _at(self.second), _int(n), _at(self.xy),
+            _at(self.m), _int(len(pairs)), _at(pairs), _at(first), _at(count),
+            _float(MAGNITUDE_GATE * np.sqrt(2.0) * d.magnitude_sigma), _float(np.nan if d.zero_point is None else d.zero_point),
+            _float(3.0 * d.magnitude_sigma), _double(0.0 if freedom.free else freedom.f_known), _double(freedom.f_low),
+            _double(freedom.f_high), _int(room), _at(ij), _at(ab), _at(f), _at(zero),
+        )  # fmt: skip
+        if h < 0:
+            raise ValueError("the pair table names stars that are not in the catalogue: it was made from another one")
+        if h == 0:
+            return None
+        sky_map = level.sky_map(
+            FAINT, tolerance_px(d, freedom) / (float(np.median(f[:h])) if freedom.free else freedom.f_known)
+        )
+        best = np.empty(keep, dtype=np.int64)
+        found = self.best(
+            n_stars, _at(self.stars), _int32(n), _at(self.xy), _at(self.m), _at(self.mixed), _int32(min(FIRST_TEST, n)), _int(h),
+            _at(ij), _at(ab), _at(f), _at(zero), _int32(sky_map.side), _at(sky_map.bits), _at(sky_map.cells), _at(MAGNITUDES),
+            _float(sharpness(d)), _int(max(FIRST_KEPT, keep, int(FIRST_SHARE * h))), _int(keep), _at(score), _at(best),
+        )  # fmt: skip
+        if found < 0:
+            raise MemoryError("no room for the scores of a chunk of hypotheses")
+        best = best[:found]
+        return _chosen(level, d, *ij[best].T, *ab[best].T, f[best], score[best])
 
 
 def _largest(score: np.ndarray, keep: int) -> np.ndarray:
@@ -302,8 +364,17 @@ def _test_order(n: int, i: np.ndarray, j: np.ndarray) -> np.ndarray:
     Bright and faint ones alike come early, as the brightest few may all be false; and each pair starts elsewhere, as any few
     may all be false: that must not fail every true pair at once.
     """
-    mixed = np.concatenate([np.arange(k, n, 3) for k in range(3)])
-    return mixed[((31 * i + 17 * j)[:, None] + np.arange(n)) % n]
+    return mixed(n)[((31 * i + 17 * j)[:, None] + np.arange(n)) % n]
+
+
+def mixed(n: int) -> np.ndarray:
+    """(n,) ranks of brightness, every third first."""
+    return np.concatenate([np.arange(k, n, 3) for k in range(3)])
+
+
+def sharpness(d: Detections) -> float:
+    """What a difference of magnitudes is multiplied with before its fourth power."""
+    return 0.45 / float(np.hypot(1.3 * d.magnitude_sigma, 0.05))
 
 
 def _score(sky_map: SkyMap, d: Detections, M: np.ndarray, i, j, zero: np.ndarray | None, which: slice) -> np.ndarray:
@@ -338,7 +409,7 @@ def _score(sky_map: SkyMap, d: Detections, M: np.ndarray, i, j, zero: np.ndarray
         z = MAGNITUDES.take(found)
         z -= m[r]
         z -= zero[begin:end, None]
-        z *= np.float32(0.45 / np.hypot(1.3 * d.magnitude_sigma, 0.05))
+        z *= np.float32(sharpness(d))
         z *= z
         z *= z
         z += np.float32(1.0)

@@ -53,6 +53,11 @@ class SkyMap:
     side: int
     cells: np.ndarray
 
+    @cached_property
+    def bits(self) -> np.ndarray:
+        """(side side / 4 + 1,) uint8: whether each cell holds a star, the first in the lowest bit; an eighth of the memory."""
+        return np.append(np.packbits(self.cells != EMPTY, bitorder="little"), np.uint8(0))
+
     def index(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Cell of directions of any length."""
         half = 0.5 * self.side
@@ -180,6 +185,7 @@ class Level:
         self.catalog, self.directions, self.fov, self.identity = catalog, directions, fov, identity
         self.single = np.ascontiguousarray(directions.T, dtype=np.float32)
         self.brightness = catalog.magnitude.astype(np.float32)
+        self.rows = np.ascontiguousarray(np.concatenate([self.single, self.brightness[None]]).T)
         self._pairs: dict[int, Pairs] = {}
         self._members: dict[int, np.ndarray] = {}
         self._maps: dict[tuple[int, int], SkyMap] = {}
