@@ -156,12 +156,12 @@ def _prepared(image: Image, dark: np.ndarray | None) -> tuple[np.ndarray, float]
         if dark.shape != array.shape:
             raise ValueError(f"dark of shape {dark.shape}: the image has {array.shape}")
         array = array.astype(np.float32) - dark.astype(np.float32)
-    if array.dtype != np.uint8:
-        array = array.astype(np.float32)
+    if array.dtype not in (np.uint8, np.uint16):
+        array = array.astype(np.float32, copy=False)
         if not np.isfinite(array.sum()):  # numbers without value shine nowhere
             finite = np.isfinite(array)
             array = np.where(finite, array, np.median(array[finite]) if finite.any() else 0.0).astype(np.float32)
-    return array, _quantum(image)
+    return np.ascontiguousarray(array), _quantum(image)
 
 
 def _at_scale(

@@ -7,15 +7,20 @@ of rows that stay in the processor's cache, in whole numbers where these are 8 b
 
 from __future__ import annotations
 
+from ctypes import c_float, c_int, c_int64, c_void_p
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 
-from .background import PER_TILE, mesh_of
+from ..native import kernels
+from .background import PER_TILE, grid, mesh_from, mesh_of
 
 TILES = (64, 48, 32)
 """Side of a tile of the sky's mesh at each level, in its own pixels."""
 _BAND = 128
+_ROOM = 4096  # places that are made room for at first
 WEIGHT = 16.0
 """Sum of the filter's weights."""
 _NOISE = 6.0  # root of the sum of their squares: from a pixel's noise to the filtered noise
@@ -32,14 +37,18 @@ class Peaks:
 
 
 def wide(array: np.ndarray) -> np.dtype:
-    """The type in which sums over levels and filters of 8 bit images do not overflow; float32 for others."""
+    """The type in which sums over 2 x 2 pixels do not overflow: uint16 for 8 bit images, float32 for others."""
     return np.dtype(np.uint16 if array.dtype == np.uint8 else np.float32)
 
 
 def halve(array: np.ndarray) -> np.ndarray:
     """Sums over 2 x 2 pixels; an odd last row or column is left out."""
     h, w = array.shape[0] // 2 * 2, array.shape[1] // 2 * 2
-    out = np.empty((h // 2, w // 2), wide(array) if array.dtype == np.uint8 else array.dtype)
+    out = np.empty((h // 2, w // 2), wide(array))
+    library = kernels()
+    if library is not None and array.dtype in _TYPES and array.flags.c_contiguous:
+        _declared(library).helmstar_halve(array.ctypes.data, _TYPES[array.dtype], *array.shape, out.ctypes.data)
+        return out
     for i in range(0, h, 2 * _BAND):
         a = array[i : min(i + 2 * _BAND, h), :w]
         rows = np.add(a[::2], a[1::2], dtype=out.dtype)
@@ -73,10 +82,14 @@ def find_peaks(array: np.ndarray, level: int, threshold: float, quantum: float) 
     quantum: step of the numbers in a pixel of level 0, below which no noise is believed.
     """
     h, w = array.shape
-    out = np.dtype(np.uint16 if array.dtype in (np.uint8, np.uint16) else np.float32)
     tile = TILES[level]
     stride = max(1, tile // PER_TILE)
     floor = quantum / np.sqrt(12.0) * 2**level * _NOISE
+    library = kernels()
+    if library is not None and array.dtype in _TYPES and array.flags.c_contiguous:
+        return _find_compiled(_declared(library), array, tile, stride, threshold, floor)
+    # Pixels of 16 bit overflow it; sums over 2 x 2 pixels of 8 bit do not.
+    out = np.dtype(np.uint16 if array.dtype == np.uint8 or (level and array.dtype == np.uint16) else np.float32)
     f = filtered(array, out)
     mesh = mesh_of(f[::stride, : w - 2 : stride], (h - 2, w - 2), tile, floor)
     lower, rows = mesh.least(threshold)
@@ -97,6 +110,53 @@ def find_peaks(array: np.ndarray, level: int, threshold: float, quantum: float) 
     excess = value.astype(np.float32) - sky
     keep = np.flatnonzero(excess > np.float32(threshold) * noise)
     return Peaks(x[keep] + 1, y[keep] + 1, excess[keep], noise[keep])
+
+
+_TYPES = {np.dtype(np.uint8): 0, np.dtype(np.uint16): 1, np.dtype(np.float32): 2}
+
+
+def _find_compiled(library: Any, array: np.ndarray, tile: int, stride: int, threshold: float, floor: float) -> Peaks:
+    """The same by pyramid.c."""
+    h, w = array.shape
+    g = grid((h - 2, w - 2), (-(-(h - 2) // stride), -(-(w - 2) // stride)), tile)
+    rows, columns = np.multiply(g.rows, stride), np.multiply(g.columns, stride)
+    values = np.empty((len(rows), len(columns)), np.float32)
+    image = array.ctypes.data, _TYPES[array.dtype], h, w
+    library.helmstar_filtered_at(
+        *image, rows.ctypes.data, len(rows), columns.ctypes.data, len(columns), values.ctypes.data
+    )
+    mesh = mesh_from(values, g, floor)
+    bands, work, room = mesh.bands, np.empty((9, w), np.float32), _ROOM
+    while True:
+        places, light = np.empty((2, room), int), np.empty((2, room), np.float32)
+        found = library.helmstar_peaks(
+            *image, mesh.sky.ctypes.data, mesh.noise.ctypes.data, *mesh.sky.shape, bands.ctypes.data, threshold,
+            work.ctypes.data, room, *(a.ctypes.data for a in (*places, *light)),
+        )  # fmt: skip
+        if found <= room:
+            return Peaks(places[0, :found], places[1, :found], light[0, :found], light[1, :found])
+        room = found
+
+
+@cache
+def _declared(library: Any) -> Any:
+    """The library with the types of what is called here."""
+    image = [c_void_p, c_int, c_int64, c_int64]
+    library.helmstar_halve.argtypes = [*image, c_void_p]
+    library.helmstar_filtered_at.argtypes = [*image, c_void_p, c_int64, c_void_p, c_int64, c_void_p]
+    library.helmstar_peaks.argtypes = [
+        *image,
+        c_void_p,
+        c_void_p,
+        c_int64,
+        c_int64,
+        c_void_p,
+        c_float,
+        c_void_p,
+        c_int64,
+    ] + [c_void_p] * 4
+    library.helmstar_peaks.restype = c_int64
+    return library
 
 
 __all__ = ["TILES", "WEIGHT", "Peaks", "filtered", "find_peaks", "halve", "wide"]
