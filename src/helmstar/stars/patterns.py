@@ -251,9 +251,13 @@ class Sky:
 
     def near(self, i: int, centre: np.ndarray, radius: float) -> np.ndarray:
         """Catalogue indices, brightest first, of level i's deep stars within `radius` (rad) of a direction (3,)."""
+        return _in_circle(*self.deep(i), centre, radius)
+
+    def deep(self, i: int) -> tuple[np.ndarray, np.ndarray]:
+        """Catalogue indices (m,) of level i's deep stars by declination, and their directions (m, 3)."""
         if i not in self._deep:
             self._deep[i] = self._banded(self.level(i).members(DEEP))
-        return _in_circle(*self._deep[i], centre, radius)
+        return self._deep[i]
 
     def around(self, centre: np.ndarray, radius: float) -> np.ndarray:
         """Indices, brightest first, of all the catalogue's stars within `radius` (rad) of a direction (3,)."""
@@ -264,7 +268,9 @@ class Sky:
     def _banded(self, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Members by declination, and their directions. Importing scipy's trees would take the first solution 0.5 s."""
         members = members[np.argsort(self.directions[members, 2], kind="stable")]
-        return members, np.ascontiguousarray(self.directions[members])
+        return np.ascontiguousarray(members, dtype=np.int64), np.ascontiguousarray(
+            self.directions[members], dtype=float
+        )
 
 
 def _in_circle(members: np.ndarray, directions: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:

@@ -6,17 +6,26 @@ time that a refusal takes. Stars find their detections through a raster, so that
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
 
 import numpy as np
 
+from ..native import kernels
 from .patterns import Sky
 from .verify import (
+    BROAD_SHARE,
     GATE,
+    HARMONIC,
+    LOG_FACTORIAL,
+    SO3_VOLUME,
+    ZERO_POINT_RANGE,
     Detections,
     Freedom,
+    broad_sigma,
     deepest,
     fit_volumes,
+    focal_volume,
     inside,
     log_odds,
     magnitude_gain,
@@ -29,6 +38,8 @@ FIRST_GATE, SECOND_GATE = 4.0, 2.5
 """Of the two rounds, over GATE sigma."""
 SIDE = 512
 """Most cells along the raster's longer side."""
+MOST_IN_C = 128
+"""Detections that screen.c has room for."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +88,9 @@ def screen(
     sky: Sky, level: int, d: Detections, cells: Raster, R: np.ndarray, f: np.ndarray, freedom: Freedom
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Log odds (h,) of hypotheses R (h, 3, 3), f (h,) after one step, and the R and f that the step led to."""
+    library = kernels()
+    if library is not None and len(d) <= MOST_IN_C:
+        return _compiled(library, sky, level, d, cells, R, f, freedom)
     most = deepest(d)
     lists = [stars_near(sky, level, R[k], float(f[k]), d) for k in range(len(f))]
     star = np.concatenate(lists)
@@ -124,6 +138,57 @@ def screen(
             s = slice(edge[k], edge[k + 1])
             expected = min(int(first[k + 1] - first[k]), most)
             odds[k] = log_odds(gain[s], rank[s], expected, d.vacancy) + zero_point_price(d, int(count[k])) + volume[k]
+    return odds, R, f
+
+
+class _Screen(ctypes.Structure):
+    """As in screen.c."""
+
+    _fields_ = (
+        [(k, ctypes.c_int64) for k in ("n", "rows", "columns", "most", "members", "stars")]
+        + [(k, ctypes.c_double * 2) for k in ("low", "high", "corner")]
+        + [
+            (k, ctypes.c_double)
+            for k in ("cell", "magnitude_sigma", "zero_point", "faintest", "f_low", "f_high", "f_known")
+        ]
+        + [(k, ctypes.c_double) for k in ("f_sigma", "gate", "first_gate", "second_gate", "volume", "zero_point_range")]
+        + [(k, ctypes.c_double) for k in ("broad_share", "broad_sigma")]
+        + [
+            (k, ctypes.c_void_p)
+            for k in ("xy", "sigma", "magnitude", "log_magnitude_density", "log_density", "vacancy")
+        ]
+        + [
+            (k, ctypes.c_void_p)
+            for k in ("log_factorial", "harmonic", "directions", "V", "member", "member_directions")
+        ]
+        + [("cells", ctypes.c_void_p)]
+    )
+
+
+def _compiled(library: ctypes.CDLL, sky: Sky, level: int, d: Detections, cells: Raster, R, f, freedom: Freedom):
+    """As `screen`, by screen.c."""
+    members, member_directions = sky.deep(level)
+    doubles = {
+        "xy": d.xy, "sigma": d.sigma, "magnitude": d.magnitude, "log_magnitude_density": d.log_magnitude_density,
+        "log_density": d.log_density, "vacancy": d.vacancy, "log_factorial": LOG_FACTORIAL, "harmonic": HARMONIC,
+        "directions": sky.directions, "V": sky.magnitude, "member_directions": member_directions,
+    }  # fmt: skip
+    arrays = {k: np.ascontiguousarray(x, dtype=float) for k, x in doubles.items() if x is not None}
+    arrays["member"], arrays["cells"] = members, np.ascontiguousarray(cells.cells, dtype=np.int32)
+    s = _Screen(
+        n=len(d), rows=cells.rows, columns=cells.columns, most=deepest(d), members=len(members), stars=len(sky.directions),
+        low=tuple(d.low), high=tuple(d.high), corner=tuple(cells.low), cell=cells.cell, magnitude_sigma=d.magnitude_sigma,
+        zero_point=np.nan if d.zero_point is None else d.zero_point, faintest=d.faintest, f_low=freedom.f_low,
+        f_high=freedom.f_high, f_known=freedom.f_known, f_sigma=freedom.sigma, gate=GATE, first_gate=FIRST_GATE,
+        second_gate=SECOND_GATE, volume=SO3_VOLUME * focal_volume(freedom), zero_point_range=ZERO_POINT_RANGE,
+        broad_share=BROAD_SHARE, broad_sigma=broad_sigma(d), **{k: x.__array_interface__["data"][0] for k, x in arrays.items()},
+    )  # fmt: skip
+    R, f, odds = np.array(R, dtype=float, order="C"), np.array(f, dtype=float), np.empty(len(f))
+    done = library.helmstar_screen
+    done.restype = ctypes.c_int64
+    pointers = [ctypes.c_void_p(x.__array_interface__["data"][0]) for x in (R, f, odds)]
+    if done(ctypes.byref(s), ctypes.c_int64(len(f)), *pointers) < 0:
+        raise MemoryError("no room for the stars of a hypothesis")
     return odds, R, f
 
 

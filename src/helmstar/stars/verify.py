@@ -235,13 +235,18 @@ def zero_point_price(d: Detections, count: int) -> float:
     return math.log(min(1.0, math.sqrt(2.0 * math.pi) * sigma / ZERO_POINT_RANGE))
 
 
+def broad_sigma(d: Detections) -> float:
+    """Of magnitudes that are not what the catalogue says."""
+    return min(BROAD_SIGMA, BROAD_FACTOR * d.magnitude_sigma)
+
+
 def magnitude_gain(d: Detections, V: np.ndarray, j: np.ndarray, zero: float | np.ndarray) -> np.ndarray:
     """Log likelihood ratio (k,) of the magnitudes of stars V (k,) matched with detections j (k,), at a zero point."""
     if d.magnitude is None:
         return np.zeros(len(j))
     s = d.magnitude_sigma
     square = (V - d.magnitude[j] - zero) ** 2
-    broad = min(BROAD_SIGMA, BROAD_FACTOR * s)
+    broad = broad_sigma(d)
     density = (1.0 - BROAD_SHARE) / s * np.exp(-0.5 / s**2 * square) + BROAD_SHARE / broad * np.exp(
         -0.5 / broad**2 * square
     )
@@ -366,12 +371,17 @@ class _Field:
         return None
 
 
+def focal_volume(freedom: Freedom) -> float:
+    """Of ln f before the fit."""
+    if freedom.free:
+        return max(float(np.log(freedom.f_high / freedom.f_low)), 1e-3)
+    # The Gaussian prior of ln f stands in the information; this is its norm.
+    return math.sqrt(2.0 * math.pi) * max(freedom.sigma, 1e-6)
+
+
 def fit_volumes(information: np.ndarray, freedom: Freedom, volume: float = SO3_VOLUME) -> np.ndarray:
     """Logs (h,) of the volumes that fits of information (h, 4, 4) leave over the one they were chosen from."""
-    if freedom.free:
-        volume *= max(float(np.log(freedom.f_high / freedom.f_low)), 1e-3)
-    else:  # the Gaussian prior of ln f stands in the information; this is its norm
-        volume *= math.sqrt(2.0 * math.pi) * max(freedom.sigma, 1e-6)
+    volume *= focal_volume(freedom)
     sign, logdet = np.linalg.slogdet(information)
     price = np.minimum(0.0, 0.5 * (4.0 * math.log(2.0 * math.pi) - logdet) - math.log(volume))
     return np.where(sign > 0, price, -np.inf)
