@@ -4,7 +4,6 @@
    otherwise, which moves a direction that lies on the edge of a cell of the sky map into the next. */
 #include <math.h>
 #include <stdint.h>
-#include <stdlib.h>
 #include <string.h>
 
 #if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__linux__)
@@ -15,6 +14,7 @@
 
 #define BLOCK 128
 #define MOST 128 /* detections */
+#define TESTS 16 /* of every hypothesis, at most */
 
 /* A catalogue pair in its two orders is laid on detections i, j. Returns the number of hypotheses written, at most `room`;
    -1 where an index is out of range.
@@ -72,33 +72,57 @@ int64_t helmstar_candidates(
     return h;
 }
 
-/* What a direction meets: a map of bits, which stays in the processor's cache, before the map of magnitudes. */
+/* What a direction meets: a coarse map of bits, which stays in the processor's nearest caches, before the map of magnitudes. */
 typedef struct {
     int32_t side;
-    const uint8_t *bits;
+    const uint8_t *coarse;
     const uint8_t *cells;
     const float *magnitudes;
     float sharpness;
 } Map;
 
-/* Cells of directions M T. NaN and what lies beyond an edge come to an edge. */
-static inline __attribute__((always_inline)) int32_t cell(float x, float y, float z, float half, float almost, int32_t side)
+#define COARSE 2 /* a coarse cell is 2^COARSE cells wide */
+#define EMPTY 255
+
+/* Cell of a direction, and its coarse cell. NaN and what lies beyond an edge come to an edge. */
+static inline __attribute__((always_inline)) int32_t cell(
+    float x, float y, float z, float half, float almost, int32_t side, int32_t wide, int32_t *coarse)
 {
     float scale = almost / (fabsf(x) + fabsf(y) + fabsf(z)), last = (float)(side - 1);
     float u = x * scale + half, v = y * scale + half;
     u = u > 0.0f ? u : 0.0f, v = v > 0.0f ? v : 0.0f;
     u = u < last ? u : last, v = v < last ? v : last;
-    return (int32_t)u * side + (int32_t)v + (z < 0.0f ? side * side : 0);
+    int32_t row = (int32_t)u, column = (int32_t)v, south = z < 0.0f;
+    *coarse = (row >> COARSE) * wide + (column >> COARSE) + (south ? wide * wide : 0);
+    return row * side + column + (south ? side * side : 0);
 }
 
-static inline __attribute__((always_inline)) int full(const Map *map, int32_t at)
+static inline __attribute__((always_inline)) int full(const Map *map, int32_t coarse)
 {
-    return (map->bits[at >> 3] >> (at & 7)) & 1;
+    return (map->coarse[coarse >> 3] >> (coarse & 7)) & 1;
 }
 
-static inline __attribute__((always_inline)) float weight(const Map *map, int32_t at, float m, float zero)
+/* A test that met a full coarse cell. They are listed before anything is looked up: no branch that nobody can predict, and all of a
+   block wait for the memory together. */
+typedef struct {
+    int32_t at, hypothesis, test;
+} Hit;
+
+/* Keeps those whose cell holds a star, its value in place of the cell. */
+static inline __attribute__((always_inline)) int32_t taken(const Map *map, Hit *hit, int32_t hits)
 {
-    float z = (map->magnitudes[map->cells[at]] - m - zero) * map->sharpness;
+    int32_t kept = 0;
+    for (int32_t k = 0; k < hits; k++) {
+        int32_t value = map->cells[hit[k].at];
+        hit[kept] = (Hit){value, hit[k].hypothesis, hit[k].test};
+        kept += value != EMPTY;
+    }
+    return kept;
+}
+
+static inline __attribute__((always_inline)) float weight(const Map *map, int32_t value, float m, float zero)
+{
+    float z = (map->magnitudes[value] - m - zero) * map->sharpness;
     z *= z;
     z *= z;
     return 1.0f / (z + 1.0f);
@@ -154,9 +178,10 @@ EVERY_MACHINE static void score_block(
     const double *f, const float *zero, float *score)
 {
     float M[9][BLOCK], v[9];
-    int32_t at[BLOCK], hit[BLOCK];
+    int32_t at[BLOCK], coarse[BLOCK], hits = 0;
+    Hit hit[BLOCK * TESTS];
     float half = 0.5f * (float)map->side, almost = (float)(0.5 * map->side * (1.0 - 1e-6));
-    int32_t side = map->side;
+    int32_t side = map->side, wide = (side + (1 << COARSE) - 1) >> COARSE;
     for (int32_t h = 0; h < count; h++) {
         lay(run, stars + 4 * (int64_t)ab[2 * h], stars + 4 * (int64_t)ab[2 * h + 1], (float)f[h], v);
         for (int r = 0; r < 9; r++)
@@ -168,21 +193,16 @@ EVERY_MACHINE static void score_block(
         for (int32_t h = 0; h < count; h++)
             at[h] = cell(
                 M[0][h] * a + M[3][h] * b + M[6][h] * e, M[1][h] * a + M[4][h] * b + M[7][h] * e,
-                M[2][h] * a + M[5][h] * b + M[8][h] * e, half, almost, side);
-        if (magnitude == NULL) {
-            for (int32_t h = 0; h < count; h++)
-                score[h] += (float)full(map, at[h]);
-            continue;
-        }
-        /* Listed first, without a branch that nobody can predict. */
-        float m = magnitude[run->who[t]];
-        int32_t hits = 0;
+                M[2][h] * a + M[5][h] * b + M[8][h] * e, half, almost, side, wide, coarse + h);
         for (int32_t h = 0; h < count; h++) {
-            hit[hits] = h;
-            hits += full(map, at[h]);
+            hit[hits] = (Hit){at[h], h, t};
+            hits += full(map, coarse[h]);
         }
-        for (int32_t k = 0; k < hits; k++)
-            score[hit[k]] += weight(map, at[hit[k]], m, zero[hit[k]]);
+    }
+    hits = taken(map, hit, hits);
+    for (int32_t k = 0; k < hits; k++) {
+        int32_t h = hit[k].hypothesis;
+        score[h] += magnitude == NULL ? 1.0f : weight(map, hit[k].at, magnitude[run->who[hit[k].test]], zero[h]);
     }
 }
 
@@ -191,20 +211,23 @@ EVERY_MACHINE static float score_one(
     const Map *map, const Run *run, const float *va, const float *vb, const float *magnitude, double f, float zero)
 {
     float M[9], half = 0.5f * (float)map->side, almost = (float)(0.5 * map->side * (1.0 - 1e-6)), sum = 0.0f;
-    int32_t at[MOST], side = map->side, count = run->count;
+    int32_t at[MOST], coarse[MOST], hits = 0, count = run->count;
+    Hit hit[MOST + 1];
+    int32_t side = map->side, wide = (side + (1 << COARSE) - 1) >> COARSE;
     lay(run, va, vb, (float)f, M);
     for (int32_t t = 0; t < count; t++) {
         float a = run->a[t], b = run->b[t], e = run->e[t];
         at[t] = cell(
-            M[0] * a + M[3] * b + M[6] * e, M[1] * a + M[4] * b + M[7] * e, M[2] * a + M[5] * b + M[8] * e, half, almost, side);
+            M[0] * a + M[3] * b + M[6] * e, M[1] * a + M[4] * b + M[7] * e, M[2] * a + M[5] * b + M[8] * e, half, almost,
+            side, wide, coarse + t);
     }
-    int32_t hit[MOST], hits = 0;
     for (int32_t t = 0; t < count; t++) {
-        hit[hits] = t;
-        hits += full(map, at[t]);
+        hit[hits] = (Hit){at[t], 0, t};
+        hits += full(map, coarse[t]);
     }
+    hits = taken(map, hit, hits);
     for (int32_t k = 0; k < hits; k++)
-        sum += magnitude == NULL ? 1.0f : weight(map, at[hit[k]], magnitude[run->who[hit[k]]], zero);
+        sum += magnitude == NULL ? 1.0f : weight(map, hit[k].at, magnitude[run->who[hit[k].test]], zero);
     return sum;
 }
 
@@ -237,16 +260,16 @@ static float largest(float *x, int64_t n, int64_t k)
 }
 
 /* The `keep` best of h hypotheses of helmstar_candidates, the best first, earlier ones first among equals: indices to `best`, all scores
-   to `score` (h,). The first `few` tests of each choose `more` of them, which the other tests are tried on.
-   Returns how many there are; -1 without memory or for what is out of range. map: cells (2 side side,), bits (side side / 4 + 1,). */
+   to the first half of `score` (2 h,), the other is used on the way. The first `few` tests of each choose `more` of them, which the other tests are tried on.
+   Returns how many there are; -1 for what is out of range. map: cells (2 side side,), coarse (side side / 64 + 1,). */
 int64_t helmstar_best(
     int64_t n_stars, const float *stars, int32_t n, const double *xy, const float *magnitude, const int32_t *mixed, int32_t few,
-    int64_t h, const int32_t *ij, const int32_t *ab, const double *f, const float *zero, int32_t side, const uint8_t *bits,
+    int64_t h, const int32_t *ij, const int32_t *ab, const double *f, const float *zero, int32_t side, const uint8_t *coarse,
     const uint8_t *cells, const float *magnitudes, float sharpness, int64_t more, int64_t keep, float *score, int64_t *best)
 {
-    Map map = {side, bits, cells, magnitudes, sharpness};
+    Map map = {side, coarse, cells, magnitudes, sharpness};
     Run run;
-    if (n < 2 || n > MOST || few < 0 || few > n || side < 1 || side > 30000 || h < 1 || keep < 1)
+    if (n < 2 || n > MOST || few < 0 || few > n || few > TESTS || side < 1 || side > 30000 || h < 1 || keep < 1)
         return -1;
     for (int32_t k = 0; k < n; k++)
         if (mixed[k] < 0 || mixed[k] >= n)
@@ -269,9 +292,7 @@ int64_t helmstar_best(
         more = h;
     if (keep > more)
         keep = more;
-    float *value = malloc(sizeof(float) * (size_t)h);
-    if (value == NULL)
-        return -1;
+    float *value = score + h;
     memcpy(value, score, sizeof(float) * (size_t)h);
     float limit = largest(value, h, more);
     int64_t above = 0, found = 0;
@@ -297,6 +318,5 @@ int64_t helmstar_best(
         memmove(best + at + 1, best + at, sizeof(int64_t) * (size_t)(last - at));
         best[at] = k;
     }
-    free(value);
     return found;
 }

@@ -313,14 +313,23 @@ class _Compiled:
         self.xy = np.ascontiguousarray(d.xy, dtype=float)
         self.m = None if d.magnitude is None else np.ascontiguousarray(d.magnitude, dtype=np.float32)
         self.mixed = mixed(len(d)).astype(np.int32)
+        self.room = 0
 
     def chunk(self, level: Level, table: Pairs, d: Detections, pairs, first, count, freedom: Freedom, keep: int):
         room = 2 * int(count.sum())
         if room == 0:
             return None
         pairs, first, count = (np.ascontiguousarray(x, dtype=np.int64) for x in (pairs, first, count))
-        ij, ab = np.empty((room, 2), dtype=np.int32), np.empty((room, 2), dtype=np.int32)
-        f, zero, score = np.empty(room), np.empty(room, dtype=np.float32), np.empty(room, dtype=np.float32)
+        if room > self.room:
+            # Kept from chunk to chunk: fresh memory costs more than what is written there.
+            self.room = room
+            self.ij, self.ab = np.empty((room, 2), dtype=np.int32), np.empty((room, 2), dtype=np.int32)
+            self.f, self.zero, self.score = (
+                np.empty(room),
+                np.empty(room, dtype=np.float32),
+                np.empty(2 * room, dtype=np.float32),
+            )
+        ij, ab, f, zero, score = self.ij, self.ab, self.f, self.zero, self.score
         n_stars, n = _int(len(self.stars)), len(d)
         h = self.candidates(
             n_stars, _at(self.stars), _int(len(self.first)), _at(self.first), _at(self.second), _int(n), _at(self.xy),
@@ -339,11 +348,11 @@ class _Compiled:
         best = np.empty(keep, dtype=np.int64)
         found = self.best(
             n_stars, _at(self.stars), _int32(n), _at(self.xy), _at(self.m), _at(self.mixed), _int32(min(FIRST_TEST, n)), _int(h),
-            _at(ij), _at(ab), _at(f), _at(zero), _int32(sky_map.side), _at(sky_map.bits), _at(sky_map.cells), _at(MAGNITUDES),
+            _at(ij), _at(ab), _at(f), _at(zero), _int32(sky_map.side), _at(sky_map.coarse), _at(sky_map.cells), _at(MAGNITUDES),
             _float(sharpness(d)), _int(max(FIRST_KEPT, keep, int(FIRST_SHARE * h))), _int(keep), _at(score), _at(best),
         )  # fmt: skip
         if found < 0:
-            raise MemoryError("no room for the scores of a chunk of hypotheses")
+            raise ValueError("a chunk of hypotheses is out of range")
         best = best[:found]
         return _chosen(level, d, *ij[best].T, *ab[best].T, f[best], score[best])
 

@@ -54,9 +54,14 @@ class SkyMap:
     cells: np.ndarray
 
     @cached_property
-    def bits(self) -> np.ndarray:
-        """(side side / 4 + 1,) uint8: whether each cell holds a star, the first in the lowest bit; an eighth of the memory."""
-        return np.append(np.packbits(self.cells != EMPTY, bitorder="little"), np.uint8(0))
+    def coarse(self) -> np.ndarray:
+        """(bytes,) uint8: whether there is a star in each square of 4 x 4 cells, the first in the lowest bit: what fits a cache."""
+        wide = -(-self.side // 4)
+        full = np.zeros((2, 4 * wide, 4 * wide), dtype=bool)
+        full[:, : self.side, : self.side] = self.cells.reshape(2, self.side, self.side) != EMPTY
+        full = full[:, 0::4] | full[:, 1::4] | full[:, 2::4] | full[:, 3::4]
+        full = full[:, :, 0::4] | full[:, :, 1::4] | full[:, :, 2::4] | full[:, :, 3::4]
+        return np.append(np.packbits(full, bitorder="little"), np.uint8(0))
 
     def index(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Cell of directions of any length."""
