@@ -135,12 +135,12 @@ INLINE void substitute(lanes L[6][6], lanes inverse[6], lanes b[6]) {
 }
 
 /* windows (n, m, m), x, y, sky, noise (n,), filled (n, m, m) bytes; width (2,).
-   Out: p (n, 6) flux, sky above the first guess, x, y, sigma_x, sigma_y; bread, light (n, 6, 6); residual, model (n, m, m).
-   Returns 0; 1 where the window's side is none of those that it takes. */
+   Out: p (n, 6) flux, sky above the first guess, x, y, sigma_x, sigma_y; bread, light (n, 6, 6); residual, model (n, m, m); sums (n, 4)
+   of the model, its square, the residual's square, and of the light that the fit took. Returns 0; 1 for windows of a side that it does not take. */
 FAST int helmstar_fit(
     const float *windows, const float *x, const float *y, const float *sky, const float *noise, const uint8_t *filled,
     int64_t n, int m, const double *width, double tight, int iterations, double *p_out, float *bread, float *light,
-    float *residual, float *model) {
+    float *residual, float *model, float *sums) {
     if (m < 1 || m > MOST || m % 2 == 0) return 1;
     const int pixels = m * m;
     const float half = (float)(m / 2);
@@ -214,16 +214,19 @@ FAST int helmstar_fit(
         for (int a = 0; a < 2; a++) prior[4 + a] = (spread[a] / p[0]) * (spread[a] / p[0]);
         normal(A, &fx, &fy, prior, m);
         decompose(A, L, inverse);
+        lanes B[6][6];
         for (int a = 0; a < 6; a++) {
             lanes column[6];
             for (int b = 0; b < 6; b++) column[b] = all(a == b ? 1.0f : 0.0f);
             substitute(L, inverse, column);
             for (int b = 0; b < 6; b++)
                 for (int l = 0; l < some; l++) bread[(first + l) * 36 + 6 * b + a] = column[b][l];
+            for (int b = 0; b < 6; b++) B[b][a] = column[b];
         }
-        lanes Gx[4][4], Gy[4][4];
+        lanes Gx[4][4], Gy[4][4], taken = all(0), sum = all(0), square = all(0), left = all(0);
         products(Gx, &fx, m, 1), products(Gy, &fy, m, 1);
         outer(A, Gx, Gy);
+        for (int a = 0; a < 36; a++) taken += B[a / 6][a % 6] * A[a / 6][a % 6];
         for (int l = 0; l < some; l++)
             for (int a = 0; a < 36; a++) light[(first + l) * 36 + a] = A[a / 6][a % 6][l];
         for (int i = 0; i < m; i++) {
@@ -232,14 +235,18 @@ FAST int helmstar_fit(
                 const int at = i * m + j;
                 const lanes shine = bright * fx.share[j];
                 const lanes rest = (lanes)((marks)(data[at] - shine - p[1]) & open[at]);
+                sum += shine, square += shine * shine, left += rest * rest;
                 for (int l = 0; l < some; l++) {
                     model[(first + l) * pixels + at] = shine[l];
                     residual[(first + l) * pixels + at] = rest[l];
                 }
             }
         }
-        for (int l = 0; l < some; l++)
+        const lanes told[4] = {sum, square, left, taken * p[0]};
+        for (int l = 0; l < some; l++) {
             for (int a = 0; a < 6; a++) p_out[(first + l) * 6 + a] = (double)p[a][l];
+            for (int a = 0; a < 4; a++) sums[(first + l) * 4 + a] = told[a][l];
+        }
     }
     return 0;
 }

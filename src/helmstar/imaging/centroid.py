@@ -41,6 +41,7 @@ class Fit:
 
     bread: (n, 6, 6) inverse of J^T J; light: (n, 6, 6) J^T diag(share of the light) J. J is over the flux, for flux over flux, sky
     over flux, x, y, sigma_x, sigma_y. residual: (n, m, m) window minus model, 0 where filled. model: (n, m, m) without the sky.
+    sums: (n, 4) over the window of model, its square and the residual's, and of the light that the fit took (see `gain_of`).
     """
 
     x: np.ndarray
@@ -52,6 +53,7 @@ class Fit:
     light: np.ndarray
     residual: np.ndarray
     model: np.ndarray
+    sums: np.ndarray
 
     def place_covariance(self, noise: np.ndarray, gain: float) -> np.ndarray:
         """(n, 2, 2) of x, y for a noise (n,) of each pixel without light and `gain` of variance for each unit of light."""
@@ -172,7 +174,9 @@ def fit(
     light = (by_light[1].take(_BY_Y, axis=1) * by_light[0].take(_BY_X, axis=1)).reshape(n, 6, 6)
     bread = np.linalg.inv(_normal(F, _prior(spread, flux, m)))
     p = p.astype(float)
-    return Fit(p[:, 2], p[:, 3], p[:, 0], sky + p[:, 1], p[:, 4:], bread, light, rest, model)
+    square, left = np.einsum("nij,nij->n", model, model), np.einsum("nij,nij->n", rest, rest)
+    sums = np.stack([model.sum(axis=(1, 2)), square, left, p[:, 0] * (bread * light).sum(axis=(1, 2))], axis=1)
+    return Fit(p[:, 2], p[:, 3], p[:, 0], sky + p[:, 1], p[:, 4:], bread, light, rest, model, sums)
 
 
 def _fit_compiled(
@@ -183,18 +187,20 @@ def _fit_compiled(
     n, m, _ = windows.shape
     given = [np.ascontiguousarray(a, np.float32) for a in (windows, x, y, sky, noise)]
     given += [np.ascontiguousarray(filled, bool), np.ascontiguousarray(width, float)]
-    p, matrices, images = np.empty((n, 6)), np.empty((2, n, 6, 6), np.float32), np.empty((2, n, m, m), np.float32)
-    out = [a.ctypes.data for a in (p, *matrices, *images)]
+    p, sums = np.empty((n, 6)), np.empty((n, 4), np.float32)
+    bread, light = np.empty((2, n, 6, 6), np.float32)
+    residual, model = np.empty((2, n, m, m), np.float32)
+    out = [a.ctypes.data for a in (p, bread, light, residual, model, sums)]
     given_at = [a.ctypes.data for a in given]
     if _declared(library).helmstar_fit(*given_at[:6], n, m, given_at[6], tight, iterations, *out):
         return None
-    return Fit(p[:, 2], p[:, 3], p[:, 0], sky + p[:, 1], p[:, 4:], *matrices, *images)
+    return Fit(p[:, 2], p[:, 3], p[:, 0], sky + p[:, 1], p[:, 4:], bread, light, residual, model, sums)
 
 
 @cache
 def _declared(library: Any) -> Any:
     """The library with the types of what is called here."""
-    library.helmstar_fit.argtypes = [c_void_p] * 6 + [c_int64, c_int, c_void_p, c_double, c_int] + [c_void_p] * 5
+    library.helmstar_fit.argtypes = [c_void_p] * 6 + [c_int64, c_int, c_void_p, c_double, c_int] + [c_void_p] * 6
     return library
 
 
@@ -233,12 +239,10 @@ def gain_of(f: Fit, noise: np.ndarray, use: np.ndarray) -> float:
     some = np.flatnonzero(use)
     if not some.size:
         return 0.0
-    r = f.residual[some].reshape(len(some), -1)
-    total = f.model[some].sum(axis=(1, 2))
-    taken = f.flux[some] * (f.bread[some] * f.light[some]).sum(axis=(1, 2))
-    left = np.maximum(total - taken, 0.02 * total)
-    excess = np.einsum("ij,ij->i", r, r) - noise[some] ** 2 * (r.shape[1] - _PARAMETERS)
-    ratio = np.sort(excess / left)
+    total, _, left, taken = f.sums[some].T
+    excess = left - noise[some] ** 2 * (f.residual[0].size - _PARAMETERS)
+    bare = np.maximum(total - taken, 0.02 * total)
+    ratio = np.sort(excess / bare)
     return float(max(0.5 * (ratio[(len(ratio) - 1) // 2] + ratio[len(ratio) // 2]), 0.0))
 
 

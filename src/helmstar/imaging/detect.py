@@ -7,15 +7,20 @@ A place is no star if its light is one pixel's (hot pixel) or one row's or colum
 from __future__ import annotations
 
 from collections.abc import Sequence
+from ctypes import c_double, c_int, c_int64, c_void_p
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 
+from ..native import kernels
 from .background import between, mesh_of
 from .centroid import Fit, fit, gain_of
 from .frame import Centroids, Image
 from .pyramid import TILES, Peaks, find_peaks, halve
-from .windows import Windows, around, in_structure, windows
+from .windows import TYPES, Windows, around, windows
+from .windows import declared as declared_windows
 
 HALF = (3, 5, 9)
 """Half the side of a star's window at each level, px."""
@@ -112,23 +117,8 @@ def detect_near(
     level = optics.level
     reach, quantum = int(np.ceil(reach_px)), _quantum(image)
     side = reach + 2 + (3 << level)
-    w = around(image.array, at[:, 0], at[:, 1], side)
-    if dark is not None:
-        w -= around(dark, at[:, 0], at[:, 1], side)
-    ordered = np.sort(w.reshape(len(w), -1)[:, ::3], axis=1)
-    count = ordered.shape[1]
-    sky = ordered[:, count // 2]
-    noise = np.maximum(ordered[:, int(0.8413 * count)] - sky, quantum / np.sqrt(12.0))
-    f = w
-    for _ in range(1 << level):  # [1 2 1] both ways, wider for wider optics
-        f = f[:, :-2] + 2 * f[:, 1:-1] + f[:, 2:]
-        f = (f[:, :, :-2] + 2 * f[:, :, 1:-1] + f[:, :, 2:]) / 16.0
-    edge = (f.shape[1] - (2 * reach + 1)) // 2
-    f = f[:, edge : edge + 2 * reach + 1, edge : edge + 2 * reach + 1]
-    j, i = np.divmod(f.reshape(len(f), -1).argmax(axis=1), 2 * reach + 1)
-    excess = f[np.arange(len(f)), j, i] - sky
+    x, y, excess, noise = _lights(image.array, at, reach, side, level, quantum, dark)
     filtered = noise * (0.375, 0.2, 0.13)[level]  # sigma of the mean under those weights
-    x, y = at[:, 0] + i - reach, at[:, 1] + j - reach
     good = (excess > s.threshold * filtered) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     _, first = np.unique(y[good] * width + x[good], return_index=True)
     keep = np.flatnonzero(good)[first]
@@ -143,6 +133,47 @@ def detect_near(
     return _sorted(
         [_measure(array, image, x[keep], y[keep], snr, noise[keep], level, np.array(optics.width), s, quantum)], s
     )
+
+
+def _lights(
+    array: np.ndarray, at: np.ndarray, reach: int, side: int, level: int, quantum: float, dark: np.ndarray | None
+) -> tuple[np.ndarray, ...]:
+    """The brightest filtered place x, y (n,) near each place (n, 2), its excess over the median of the window, a pixel's noise.
+
+    side: half the window's. excess is NaN where a pixel of the window has no value.
+    """
+    library, times, floor = kernels(), 1 << level, quantum / np.sqrt(12.0)
+    if library is not None and array.dtype in TYPES:
+        array = np.ascontiguousarray(array)
+        dark = None if dark is None else np.ascontiguousarray(dark, np.float32)
+        n, pixels = len(at), (2 * side + 1) ** 2
+        count = -(-pixels // 3)
+        order = np.array([count // 2, int(0.8413 * count)])
+        work = np.empty(8 * (pixels + count) + pixels, np.float32)
+        xy, light = np.ascontiguousarray(at.T, np.int64), np.empty((2, n), np.float32)
+        places = np.empty((2, n), np.int64)
+        if not declared_windows(library).helmstar_near(
+            array.ctypes.data, TYPES[array.dtype], None if dark is None else dark.ctypes.data, *array.shape,
+            *(a.ctypes.data for a in xy), n, reach, side, times, order.ctypes.data, floor, work.ctypes.data, work.size,
+            *(a.ctypes.data for a in (*places, *light)),
+        ):  # fmt: skip
+            return *places, *light
+    w = around(array, at[:, 0], at[:, 1], side)
+    if dark is not None:
+        w -= around(dark, at[:, 0], at[:, 1], side)
+    ordered = np.sort(w.reshape(len(w), -1)[:, ::3], axis=1)
+    count = ordered.shape[1]
+    sky = ordered[:, count // 2]
+    noise = np.maximum(ordered[:, int(0.8413 * count)] - sky, floor)
+    f = w
+    for _ in range(times):  # [1 2 1] both ways, wider for wider optics
+        f = f[:, :-2] + 2 * f[:, 1:-1] + f[:, 2:]
+        f = (f[:, :, :-2] + 2 * f[:, :, 1:-1] + f[:, :, 2:]) / 16.0
+    edge = (f.shape[1] - (2 * reach + 1)) // 2
+    f = f[:, edge : edge + 2 * reach + 1, edge : edge + 2 * reach + 1]
+    j, i = np.divmod(f.reshape(len(f), -1).argmax(axis=1), 2 * reach + 1)
+    excess = np.where(np.isfinite(w).all(axis=(1, 2)), f[np.arange(len(f)), j, i] - sky, np.nan)
+    return at[:, 0] + i - reach, at[:, 1] + j - reach, excess, noise
 
 
 def _quantum(image: Image) -> float:
@@ -285,6 +316,12 @@ def _merged(found: list[tuple[np.ndarray, ...]], s: DetectionSettings) -> tuple[
     order = _strongest(merged[3], 3 * s.max_stars)
     x, y, level = (c[order].astype(np.float32) for c in merged[:3])
     reach = np.array(HALF, np.float32)[level.astype(int)]
+    library = kernels()
+    if library is not None:
+        apart = np.empty(len(order), bool)
+        _declared(library).helmstar_apart(*(a.ctypes.data for a in (x, y, reach)), len(order), apart.ctypes.data)
+        first = order[apart][: 5 * s.max_stars // 4]
+        return tuple(c[first] for c in merged)
     near = np.abs(x[:, None] - x) <= reach  # of the stronger one, in the columns
     near &= np.abs(y[:, None] - y) <= reach
     i, j = np.divmod(np.flatnonzero(near), len(order))
@@ -301,6 +338,14 @@ def _strongest(values: np.ndarray, count: int) -> np.ndarray:
 
 def _wider_than_a_pixel(array: np.ndarray, peaks: Peaks, quantum: float) -> np.ndarray:
     """Which places of level 0 have light beside their brightest pixel, in both directions, as even the sharpest optics give."""
+    library = kernels()
+    if library is not None and array.dtype in TYPES and array.flags.c_contiguous:
+        out = np.empty(len(peaks.x), bool)
+        given = [np.ascontiguousarray(a).ctypes.data for a in (peaks.x, peaks.y, peaks.excess, peaks.noise)]
+        declared_windows(library).helmstar_wider(
+            array.ctypes.data, TYPES[array.dtype], *array.shape, *given, len(out), quantum, out.ctypes.data
+        )
+        return out
     w = around(array, peaks.x, peaks.y, 2)
     # The filter is 16 times the local mean of light: sky in a pixel from the filtered value's.
     f = w.reshape(len(w), 25) @ _WEIGHTS
@@ -341,7 +386,7 @@ def _optics(
     if some.size < 3:
         return None
     w = windows(array, image, x[some], y[some], HALF[1], 1e-9)
-    clear = ~w.filled.any(axis=(1, 2)) & ~in_structure(w, HALF[1])
+    clear = ~w.filled.any(axis=(1, 2)) & ~w.structure
     if clear.sum() < 3:
         return None
     f = fit(w.inner[clear], w.x0[clear], w.y0[clear], w.sky[clear], w.noise[clear], np.ones(2), w.filled[clear], 0.5, 4)
@@ -356,7 +401,7 @@ def _measure(
     half = HALF[level]
     rounding = quantum / np.sqrt(12.0)
     w = windows(array, image, x, y, half, np.minimum(floor, rounding))
-    calm = np.flatnonzero(~in_structure(w, half))
+    calm = np.flatnonzero(~w.structure)
     if not calm.size:
         return _nothing()
     if calm.size < len(x):
@@ -368,29 +413,58 @@ def _measure(
     gain = s.gain if s.gain is not None else gain_of(f, w.noise, clear)
     # Noise with a pattern (mosaics, JPEG) is larger in sums of pixels than its pixels say; the filtered image shows it.
     real = np.maximum(w.noise, floor)
-    position = f.place_covariance(real, gain)
-    expected = (real**2).astype(np.float32)[:, None, None] + np.float32(gain) * f.model
-    misfit = (np.square(f.residual) / expected).mean(axis=(1, 2))
+    position, misfit, elongation, peak, saturated = _judged(f, w, real, gain, half)
     position *= np.where(misfit > _MISFIT, misfit, 1.0)[:, None, None]
-    saturated = np.asarray(w.full.any(axis=(1, 2)))
     position[:, [0, 1], [0, 1]] += (s.optics_px**2 + 0.1**2 * saturated)[:, None]
-    noise, above = w.noise, w.above
-    star = _is_star(f, noise, half, s)
+    star = _is_star(f, w.noise, half, s)
     if widths is not None:
         widths.append(f.sigma[star])
-    peak = above.max(axis=(1, 2))
     everything = Centroids(
         x_px=x + f.x, y_px=y + f.y, flux=f.flux, covariance_px=position, peak=peak, saturated=saturated,
-        elongation=_elongation(above, f, half), snr=snr,
+        elongation=elongation, snr=snr,
     )  # fmt: skip
     return everything.take(star)
+
+
+def _judged(f: Fit, w: Windows, real: np.ndarray, gain: float, half: int) -> tuple[np.ndarray, ...]:
+    """Of each fit: covariance (n, 2, 2) of its place from noise and light, chi-square of a pixel, elongation, peak, saturated."""
+    library = kernels()
+    if library is not None and half <= HALF[-1]:
+        return _judged_compiled(_declared(library), f, w, real, gain)
+    expected = (real**2).astype(np.float32)[:, None, None] + np.float32(gain) * f.model
+    misfit = (np.square(f.residual) / expected).mean(axis=(1, 2))
+    peak, saturated = w.above.max(axis=(1, 2)), np.asarray(w.full.any(axis=(1, 2)))
+    return f.place_covariance(real, gain), misfit, _elongation(w.above, f, half), peak, saturated
+
+
+def _judged_compiled(library: Any, f: Fit, w: Windows, real: np.ndarray, gain: float) -> tuple[np.ndarray, ...]:
+    """The same by detect.c."""
+    n, m, _ = f.model.shape
+    p = np.empty((n, 6))
+    p[:, 0], p[:, 1], p[:, 2], p[:, 3], p[:, 4:] = f.flux, f.sky, f.x, f.y, f.sigma
+    given = [np.ascontiguousarray(a, np.float32) for a in (f.model, f.residual, w.above)]
+    given += [np.ascontiguousarray(w.full, bool), np.ascontiguousarray(f.bread, np.float32)]
+    given += [np.ascontiguousarray(f.light, np.float32), p, np.ascontiguousarray(real, np.float32)]
+    place, told, saturated = np.empty((n, 2, 2)), np.empty((3, n), np.float32), np.empty(n, bool)
+    out = [a.ctypes.data for a in (place, *told, saturated)]
+    library.helmstar_judge(*(a.ctypes.data for a in given), n, m, gain, *out)
+    return place, *told, saturated
+
+
+@cache
+def _declared(library: Any) -> Any:
+    """The library with the types of what is called here."""
+    library.helmstar_judge.argtypes = [c_void_p] * 8 + [c_int64, c_int, c_double] + [c_void_p] * 5
+    for f in (library.helmstar_apart, library.helmstar_alone):
+        f.argtypes, f.restype = [c_void_p] * 3 + [c_int64, c_void_p], None
+    return library
 
 
 def _is_star(f: Fit, noise: np.ndarray, half: int, s: DetectionSettings) -> np.ndarray:
     """Which fits look like a star: centred, neither a pixel nor a plane, and more light than the roughness around them."""
     wide, narrow = f.sigma.max(axis=1), f.sigma.min(axis=1)
-    light = np.einsum("nij,nij->n", f.model, f.model)
-    explained = light / (light + np.einsum("nij,nij->n", f.residual, f.residual))
+    light = f.sums[:, 1]
+    explained = light / (light + f.sums[:, 2])
     # At the coarsest level nothing wider is tried: a smeared or badly focused star may fill the window if little else does.
     wider = (wide < _FILLS * half) & (explained > _WELL) if half == HALF[-1] else False
     return (
@@ -420,6 +494,11 @@ def _elongation(above: np.ndarray, f: Fit, half: int) -> np.ndarray:
 def _alone(stars: Centroids) -> np.ndarray:
     """Indices of stars that are not a second finding, or an artefact, of a brighter one close by; brightest first."""
     x, y, flux = stars.x_px.astype(np.float32), stars.y_px.astype(np.float32), stars.flux
+    library = kernels()
+    if library is not None:
+        alone, flux = np.empty(len(x), bool), np.ascontiguousarray(flux, float)
+        _declared(library).helmstar_alone(*(a.ctypes.data for a in (x, y, flux)), len(x), alone.ctypes.data)
+        return np.flatnonzero(alone)
     i, j = np.divmod(np.flatnonzero(np.abs(x[:, None] - x) < 14.0), max(len(x), 1))
     later = np.flatnonzero((j < i) & (np.abs(y[i] - y[j]) < 14.0))
     i, j = i[later], j[later]

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..native import kernels
 from .background import PER_TILE, grid, mesh_from, mesh_of
+from .windows import TYPES
 
 TILES = (64, 48, 32)
 """Side of a tile of the sky's mesh at each level, in its own pixels."""
@@ -46,8 +47,8 @@ def halve(array: np.ndarray) -> np.ndarray:
     h, w = array.shape[0] // 2 * 2, array.shape[1] // 2 * 2
     out = np.empty((h // 2, w // 2), wide(array))
     library = kernels()
-    if library is not None and array.dtype in _TYPES and array.flags.c_contiguous:
-        _declared(library).helmstar_halve(array.ctypes.data, _TYPES[array.dtype], *array.shape, out.ctypes.data)
+    if library is not None and array.dtype in TYPES and array.flags.c_contiguous:
+        _declared(library).helmstar_halve(array.ctypes.data, TYPES[array.dtype], *array.shape, out.ctypes.data)
         return out
     for i in range(0, h, 2 * _BAND):
         a = array[i : min(i + 2 * _BAND, h), :w]
@@ -86,7 +87,7 @@ def find_peaks(array: np.ndarray, level: int, threshold: float, quantum: float) 
     stride = max(1, tile // PER_TILE)
     floor = quantum / np.sqrt(12.0) * 2**level * _NOISE
     library = kernels()
-    if library is not None and array.dtype in _TYPES and array.flags.c_contiguous:
+    if library is not None and array.dtype in TYPES and array.flags.c_contiguous:
         return _find_compiled(_declared(library), array, tile, stride, threshold, floor)
     # Pixels of 16 bit overflow it; sums over 2 x 2 pixels of 8 bit do not.
     out = np.dtype(np.uint16 if array.dtype == np.uint8 or (level and array.dtype == np.uint16) else np.float32)
@@ -112,16 +113,13 @@ def find_peaks(array: np.ndarray, level: int, threshold: float, quantum: float) 
     return Peaks(x[keep] + 1, y[keep] + 1, excess[keep], noise[keep])
 
 
-_TYPES = {np.dtype(np.uint8): 0, np.dtype(np.uint16): 1, np.dtype(np.float32): 2}
-
-
 def _find_compiled(library: Any, array: np.ndarray, tile: int, stride: int, threshold: float, floor: float) -> Peaks:
     """The same by pyramid.c."""
     h, w = array.shape
     g = grid((h - 2, w - 2), (-(-(h - 2) // stride), -(-(w - 2) // stride)), tile)
     rows, columns = np.multiply(g.rows, stride), np.multiply(g.columns, stride)
     values = np.empty((len(rows), len(columns)), np.float32)
-    image = array.ctypes.data, _TYPES[array.dtype], h, w
+    image = array.ctypes.data, TYPES[array.dtype], h, w
     library.helmstar_filtered_at(
         *image, rows.ctypes.data, len(rows), columns.ctypes.data, len(columns), values.ctypes.data
     )

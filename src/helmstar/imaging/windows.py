@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from ctypes import c_float, c_int, c_int64, c_void_p
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 
+from ..native import kernels
 from .frame import Image
 
 BORDER = 2
@@ -26,37 +29,43 @@ def around(array: np.ndarray, x: np.ndarray, y: np.ndarray, half: int) -> np.nda
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows of n places at one level: inner (n, m, m) pixels, ring (n, k) pixels around, filled (n, m, m) what says nothing.
+    """Windows of n places at one level: inner (n, m, m) pixels, above (n, m, m) what of them is above the sky, full (n, m, m)
+    what is saturated, filled (n, m, m) what says nothing.
 
-    noise: (n,) spread of the ring; grain: (n,) the same without what is smooth.
+    sky: (n,) of the ring around, noise: (n,) its spread; grain: (n,) the same without what is smooth. x0, y0: (n,) middle of the
+    light, from the window's middle pixel. structure: (n,) bool, on a ridge or at the edge of something large.
     """
 
     inner: np.ndarray
-    ring: np.ndarray
+    above: np.ndarray
     full: np.ndarray
     filled: np.ndarray
-    outside: np.ndarray
     sky: np.ndarray
     noise: np.ndarray
     grain: np.ndarray
-    above: np.ndarray
     x0: np.ndarray
     y0: np.ndarray
+    structure: np.ndarray
 
 
 def windows(
     array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, half: int, floor: np.ndarray | float
 ) -> Windows:
     """Windows of places x, y (n,) int, half the side in px. floor: least noise, counts."""
+    library = kernels()
+    if library is not None and array.dtype in TYPES and array.flags.c_contiguous:
+        found = _windows_compiled(library, array, image, x, y, half, floor)
+        if found is not None:
+            return found
     reach, n = half + BORDER, len(x)
     w = around(array, x, y, reach)
     border, steps_from, steps_to = _ring(half)
     pixels = w.reshape(n, -1)
     ring = pixels.take(border, axis=1)
     ordered = np.sort(ring, axis=1)
-    count = ring.shape[1]
-    sky = ordered[:, int(0.2 * count) : int(0.8 * count)].mean(axis=1)
-    noise = np.maximum((ordered[:, int(0.8413 * count)] - ordered[:, int(0.1587 * count)]) / 2, floor)
+    begin, end, low, high, step = _quantiles(half)
+    sky = ordered[:, begin:end].mean(axis=1)
+    noise = np.maximum((ordered[:, high] - ordered[:, low]) / 2, floor)
     inner = w[:, BORDER:-BORDER, BORDER:-BORDER]
     above = np.maximum(inner - sky[:, None, None], np.float32(0.0))
     full = inner >= 0.98 * image.saturation
@@ -77,9 +86,71 @@ def windows(
     total = rows.sum(axis=1)
     # From pixel to pixel along the border's rows and columns: structure that is smooth does not count as noise here.
     steps = np.sort(np.abs(pixels.take(steps_to, axis=1) - pixels.take(steps_from, axis=1)), axis=1)
-    grain = np.minimum(noise, np.maximum(steps[:, int(0.6827 * steps.shape[1])] / np.sqrt(2.0), floor))
+    grain = np.minimum(noise, np.maximum(steps[:, step] / np.sqrt(2.0), floor))
     x0, y0 = columns @ d / total, rows @ d / total
-    return Windows(inner, ring, full, full | outside, outside, sky, noise, grain, above, x0, y0)
+    structure = _in_structure(above, ring, sky, grain, half)
+    return Windows(inner, above, full, full | outside, sky, noise, grain, x0, y0, structure)
+
+
+TYPES = {np.dtype(np.uint8): 0, np.dtype(np.uint16): 1, np.dtype(np.float32): 2}
+"""Numbers by which the C sources know an image's type."""
+
+
+def _windows_compiled(
+    library: Any, array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, half: int, floor: np.ndarray | float
+) -> Windows | None:
+    """The same by windows.c; None for windows that it does not take."""
+    n, m, ring, sectors, at = len(x), 2 * half + 1, len(_ring(half)[0]), _numbers(half), _quantiles(half)
+    x, y = np.ascontiguousarray(x, np.int64), np.ascontiguousarray(y, np.int64)
+    least = np.empty(n, np.float32)
+    least[:] = floor
+    inner, above = np.empty((2, n, m, m), np.float32)
+    full, filled = np.empty((2, n, m, m), bool)
+    sky, noise, grain, x0, y0 = np.empty((5, n), np.float32)
+    structure = np.empty(n, bool)
+    out = (inner, above, full, filled, sky, noise, grain, x0, y0, structure)
+    if declared(library).helmstar_windows(
+        array.ctypes.data, TYPES[array.dtype], *array.shape, x.ctypes.data, y.ctypes.data, least.ctypes.data, n, half,
+        0.98 * image.saturation, sectors.ctypes.data, ring, at.ctypes.data, *(a.ctypes.data for a in out),
+    ):  # fmt: skip
+        return None
+    return Windows(inner, above, full, filled, sky, noise, grain, x0, y0, structure)
+
+
+@cache
+def declared(library: Any) -> Any:
+    """The library with the types of what windows.c has."""
+    image = [c_void_p, c_int, c_int64, c_int64]
+    places = [c_void_p, c_void_p, c_void_p, c_int64]
+    library.helmstar_windows.argtypes = [*image, *places, c_int, c_float, c_void_p, c_int] + [c_void_p] * 11
+    library.helmstar_wider.argtypes = [*image, c_void_p, *places, c_float, c_void_p]
+    library.helmstar_near.argtypes = (
+        [
+            c_void_p,
+            c_int,
+            c_void_p,
+            c_int64,
+            c_int64,
+            c_void_p,
+            c_void_p,
+            c_int64,
+            c_int,
+            c_int,
+            c_int,
+            c_void_p,
+            c_float,
+        ]
+        + [c_void_p, c_int64]
+        + [c_void_p] * 4
+    )
+    return library
+
+
+@cache
+def _quantiles(half: int) -> np.ndarray:
+    """Places among the sorted pixels of the ring where the sky's mean begins and ends, of low and high, and of the grain's step."""
+    ring, steps = len(_ring(half)[0]), len(_ring(half)[1])
+    return np.array([int(q * ring) for q in (0.2, 0.8, 0.1587, 0.8413)] + [int(0.6827 * steps)], np.int32)
 
 
 @cache
@@ -96,25 +167,31 @@ def _ring(half: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @cache
-def _sectors(half: int) -> tuple[np.ndarray, np.ndarray]:
-    """Ring pixels in the order of the eight directions they lie in, and where each direction starts."""
+def _numbers(half: int) -> np.ndarray:
+    """Which of eight directions, 0 to 7, each pixel of the ring lies in."""
     d = np.arange(-half - BORDER, half + BORDER + 1)
     angle = np.arctan2(d[:, None], d[None, :]).ravel()[_ring(half)[0]]
-    number = np.rint(angle / (np.pi / 4)).astype(int) % 8
+    return (np.rint(angle / (np.pi / 4)).astype(np.int32) % 8).astype(np.int32)
+
+
+@cache
+def _sectors(half: int) -> tuple[np.ndarray, np.ndarray]:
+    """Ring pixels in the order of the eight directions they lie in, and where each direction starts."""
+    number = _numbers(half)
     order = np.argsort(number, kind="stable")
     return order, np.searchsorted(number[order], np.arange(8))
 
 
-def in_structure(w: Windows, half: int) -> np.ndarray:
+def _in_structure(above: np.ndarray, ring: np.ndarray, sky: np.ndarray, grain: np.ndarray, half: int) -> np.ndarray:
     """Which places lie on a ridge (both sides of the ring bright along one line) or at the edge of something large."""
-    peak = np.max(w.above[:, half - 1 : half + 2, half - 1 : half + 2], axis=(1, 2))
+    peak = np.max(above[:, half - 1 : half + 2, half - 1 : half + 2], axis=(1, 2))
     order, starts = _sectors(half)
-    ring = w.ring.take(order, axis=1)
-    ring -= w.sky[:, None]
+    ring = ring.take(order, axis=1)
+    ring -= sky[:, None]
     most = np.maximum.reduceat(ring, starts, axis=1)
     mean = np.add.reduceat(ring, starts, axis=1) / np.diff(np.append(starts, ring.shape[1]))
-    ridge = (np.minimum(most[:, :4], most[:, 4:]) > (0.3 * peak + 3.5 * w.grain)[:, None]).any(axis=1)
-    return ridge | ((np.abs(mean) > (0.2 * peak + w.grain)[:, None]).sum(axis=1) >= 3)
+    ridge = (np.minimum(most[:, :4], most[:, 4:]) > (0.3 * peak + 3.5 * grain)[:, None]).any(axis=1)
+    return ridge | ((np.abs(mean) > (0.2 * peak + grain)[:, None]).sum(axis=1) >= 3)
 
 
-__all__ = ["BORDER", "Windows", "around", "in_structure", "windows"]
+__all__ = ["BORDER", "TYPES", "Windows", "around", "declared", "windows"]
