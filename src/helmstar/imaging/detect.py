@@ -189,7 +189,9 @@ def _prepared(image: Image, dark: np.ndarray | None) -> tuple[np.ndarray, float]
         array = array.astype(np.float32) - dark.astype(np.float32)
     if array.dtype not in (np.uint8, np.uint16):
         array = array.astype(np.float32, copy=False)
-        if not np.isfinite(array.sum()):  # numbers without value shine nowhere
+        with np.errstate(invalid="ignore", over="ignore"):
+            total = array.sum()
+        if not np.isfinite(total):  # numbers without value shine nowhere
             finite = np.isfinite(array)
             array = np.where(finite, array, np.median(array[finite]) if finite.any() else 0.0).astype(np.float32)
     return np.ascontiguousarray(array), _quantum(image)

@@ -88,7 +88,9 @@ def find_peaks(array: np.ndarray, level: int, threshold: float, quantum: float) 
     floor = quantum / np.sqrt(12.0) * 2**level * _NOISE
     library = kernels()
     if library is not None and array.dtype in TYPES and array.flags.c_contiguous:
-        return _find_compiled(_declared(library), array, tile, stride, threshold, floor)
+        found = _find_compiled(_declared(library), array, tile, stride, threshold, floor)
+        if found is not None:
+            return found
     # Pixels of 16 bit overflow it; sums over 2 x 2 pixels of 8 bit do not.
     out = np.dtype(np.uint16 if array.dtype == np.uint8 or (level and array.dtype == np.uint16) else np.float32)
     f = filtered(array, out)
@@ -113,16 +115,19 @@ def find_peaks(array: np.ndarray, level: int, threshold: float, quantum: float) 
     return Peaks(x[keep] + 1, y[keep] + 1, excess[keep], noise[keep])
 
 
-def _find_compiled(library: Any, array: np.ndarray, tile: int, stride: int, threshold: float, floor: float) -> Peaks:
-    """The same by pyramid.c."""
+def _find_compiled(
+    library: Any, array: np.ndarray, tile: int, stride: int, threshold: float, floor: float
+) -> Peaks | None:
+    """The same by pyramid.c; None for what it does not take."""
     h, w = array.shape
     g = grid((h - 2, w - 2), (-(-(h - 2) // stride), -(-(w - 2) // stride)), tile)
     rows, columns = np.multiply(g.rows, stride), np.multiply(g.columns, stride)
     values = np.empty((len(rows), len(columns)), np.float32)
     image = array.ctypes.data, TYPES[array.dtype], h, w
-    library.helmstar_filtered_at(
+    if library.helmstar_filtered_at(
         *image, rows.ctypes.data, len(rows), columns.ctypes.data, len(columns), values.ctypes.data
-    )
+    ):
+        return None
     mesh = mesh_from(values, g, floor)
     bands, work, room = mesh.bands, np.empty((9, w), np.float32), _ROOM
     while True:

@@ -60,7 +60,7 @@ def windows(
     reach, n = half + BORDER, len(x)
     w = around(array, x, y, reach)
     border, steps_from, steps_to = _ring(half)
-    pixels = w.reshape(n, -1)
+    pixels = w.reshape(n, (2 * reach + 1) ** 2)
     ring = pixels.take(border, axis=1)
     ordered = np.sort(ring, axis=1)
     begin, end, low, high, step = _quantiles(half)
