@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..native import kernels
+from .windows import address
 
 PER_TILE = 12
 """Samples along the side of a tile."""
@@ -148,7 +149,7 @@ def _quantiles_compiled(library: Any, values: np.ndarray, g: Grid) -> tuple[np.n
     sky, spread = np.empty((2, rows, columns), np.float32)
     tail, work = np.empty((rows, columns, _TAIL), np.float32), np.empty((2 * rows + 1) * columns, np.float32)
     arrays = (values, i, a, j, b, _AT, _SIGMAS, work, sky, spread, tail)
-    at = [v.ctypes.data for v in arrays]
+    at = [address(v) for v in arrays]
     library.helmstar_mesh(at[0], rows, columns, *at[1:])
     return sky, spread, tail
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..native import kernels
+from .windows import address
 
 ITERATIONS = 6
 MIN_SIGMA = 0.3
@@ -37,23 +38,44 @@ _BY_BOTH = 4 * _ALONG_Y + _ALONG_X
 
 @dataclass(frozen=True)
 class Fit:
-    """x, y: (n,) centre relative to the window's middle pixel. flux, sky: (n,). sigma: (n, 2) width along x and y, px.
+    """p: (n, 6) float64 flux, sky, x, y, sigma_x, sigma_y: centre relative to the window's middle pixel, widths in px.
 
     bread: (n, 6, 6) inverse of J^T J; light: (n, 6, 6) J^T diag(share of the light) J. J is over the flux, for flux over flux, sky
     over flux, x, y, sigma_x, sigma_y. residual: (n, m, m) window minus model, 0 where filled. model: (n, m, m) without the sky.
     sums: (n, 4) over the window of model, its square and the residual's, and of the light that the fit took (see `gain_of`).
     """
 
-    x: np.ndarray
-    y: np.ndarray
-    flux: np.ndarray
-    sky: np.ndarray
-    sigma: np.ndarray
+    p: np.ndarray
     bread: np.ndarray
     light: np.ndarray
     residual: np.ndarray
     model: np.ndarray
     sums: np.ndarray
+
+    @property
+    def flux(self) -> np.ndarray:
+        """(n,) sum of the light."""
+        return self.p[:, 0]
+
+    @property
+    def sky(self) -> np.ndarray:
+        """(n,) of a pixel."""
+        return self.p[:, 1]
+
+    @property
+    def x(self) -> np.ndarray:
+        """(n,) columns from the middle pixel."""
+        return self.p[:, 2]
+
+    @property
+    def y(self) -> np.ndarray:
+        """(n,) rows from the middle pixel."""
+        return self.p[:, 3]
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """(n, 2) width along x and y, px."""
+        return self.p[:, 4:]
 
     def place_covariance(self, noise: np.ndarray, gain: float) -> np.ndarray:
         """(n, 2, 2) of x, y for a noise (n,) of each pixel without light and `gain` of variance for each unit of light."""
@@ -174,9 +196,10 @@ def fit(
     light = (by_light[1].take(_BY_Y, axis=1) * by_light[0].take(_BY_X, axis=1)).reshape(n, 6, 6)
     bread = np.linalg.inv(_normal(F, _prior(spread, flux, m)))
     p = p.astype(float)
+    p[:, 1] += sky
     square, left = np.einsum("nij,nij->n", model, model), np.einsum("nij,nij->n", rest, rest)
     sums = np.stack([model.sum(axis=(1, 2)), square, left, p[:, 0] * (bread * light).sum(axis=(1, 2))], axis=1)
-    return Fit(p[:, 2], p[:, 3], p[:, 0], sky + p[:, 1], p[:, 4:], bread, light, rest, model, sums)
+    return Fit(p, bread, light, rest, model, sums)
 
 
 def _fit_compiled(
@@ -190,11 +213,12 @@ def _fit_compiled(
     p, sums = np.empty((n, 6)), np.empty((n, 4), np.float32)
     bread, light = np.empty((2, n, 6, 6), np.float32)
     residual, model = np.empty((2, n, m, m), np.float32)
-    out = [a.ctypes.data for a in (p, bread, light, residual, model, sums)]
-    given_at = [a.ctypes.data for a in given]
+    out = [address(a) for a in (p, bread, light, residual, model, sums)]
+    given_at = [address(a) for a in given]
     if _declared(library).helmstar_fit(*given_at[:6], n, m, given_at[6], tight, iterations, *out):
         return None
-    return Fit(p[:, 2], p[:, 3], p[:, 0], sky + p[:, 1], p[:, 4:], bread, light, residual, model, sums)
+    p[:, 1] += sky
+    return Fit(p, bread, light, residual, model, sums)
 
 
 @cache

@@ -1,16 +1,21 @@
-/* What detect.py decides star by star and pair by pair, after the fit: the twin of _judged, _merged and _alone there. */
+/* What detect.py decides star by star and pair by pair, after the fit: the twin of _judged with _is_star, of _merged and _alone. */
 #include <math.h>
 #include <stdint.h>
 
 #define MOST 19 /* widest window */
+#define COARSEST 9 /* half the side of the widest that detect.py has, and two bounds of its _is_star */
+#define FILLS 0.85
+#define WELL 0.8f
 
-/* Windows (n, m, m): model, residual, above; full (n, m, m) bytes. bread, light (n, 6, 6) and p (n, 6) of the fit, real (n,) noise.
-   Out: place (n, 2, 2) covariance, of noise and light alone; misfit (n,) chi-square of a pixel; elongation, peak (n,); saturated (n,)
-   bytes. Returns 0; 1 for windows of a side that it does not take. */
+/* Windows (n, m, m): model, residual, above; full (n, m, m) bytes. bread, light (n, 6, 6) and p (n, 6) of the fit, sums (n, 4) of the fit; real, noise
+   (n,) of a pixel; threshold in sigma.
+   Out: place (n, 2, 2) covariance, of noise and light alone; misfit (n,) chi-square of a pixel; elongation, peak (n,); saturated,
+   star (n,) bytes. Returns 0; 1 for windows of a side that it does not take. */
 int helmstar_judge(
     const float *model, const float *residual, const float *above, const uint8_t *full, const float *bread, const float *light,
-    const double *p, const float *real, int64_t n, int m, double gain, double *place, float *misfit, float *elongation, float *peak,
-    uint8_t *saturated) {
+    const double *p, const float *sums,
+    const float *real, const float *noisy, int64_t n, int m, double gain, double threshold, double *place, float *misfit, float *elongation, float *peak,
+    uint8_t *saturated, uint8_t *star) {
     if (m < 1 || m > MOST || m % 2 == 0) return 1;
     const int pixels = m * m, half = m / 2;
     const float g = (float)gain;
@@ -66,6 +71,11 @@ int helmstar_judge(
         double shorter = middle - swing;
         if (!(shorter > 0.02 * middle + 1e-12)) shorter = 0.02 * middle + 1e-12;
         elongation[s] = (float)sqrt((middle + swing) / shorter);
+        const double narrow = p[6 * s + 4] > p[6 * s + 5] ? p[6 * s + 5] : p[6 * s + 4];
+        const float explained = sums[4 * s + 1] / (sums[4 * s + 1] + sums[4 * s + 2]);
+        const int wider = half == COARSEST && wide < FILLS * half && explained > WELL;
+        star[s] = flux > 0.6 * threshold * (double)noisy[s] * sqrt(12.566370614359172 * wide * narrow) && fabs(x) < 0.6 * half &&
+                  fabs(y) < 0.6 * half && (wide < 0.6 * half || wider) && explained > 0.4f;
     }
     return 0;
 }

@@ -19,7 +19,7 @@ from .background import between, mesh_of
 from .centroid import Fit, fit, gain_of
 from .frame import Centroids, Image
 from .pyramid import TILES, Peaks, find_peaks, halve
-from .windows import TYPES, Windows, around, windows
+from .windows import TYPES, Windows, address, around, windows
 from .windows import declared as declared_windows
 
 HALF = (3, 5, 9)
@@ -153,9 +153,9 @@ def _lights(
         xy, light = np.ascontiguousarray(at.T, np.int64), np.empty((2, n), np.float32)
         places = np.empty((2, n), np.int64)
         if not declared_windows(library).helmstar_near(
-            array.ctypes.data, TYPES[array.dtype], None if dark is None else dark.ctypes.data, *array.shape,
-            *(a.ctypes.data for a in xy), n, reach, side, times, order.ctypes.data, floor, work.ctypes.data, work.size,
-            *(a.ctypes.data for a in (*places, *light)),
+            address(array), TYPES[array.dtype], None if dark is None else address(dark), *array.shape,
+            *(address(a) for a in xy), n, reach, side, times, address(order), floor, address(work), work.size,
+            *(address(a) for a in (*places, *light)),
         ):  # fmt: skip
             return *places, *light
     w = around(array, at[:, 0], at[:, 1], side)
@@ -227,9 +227,12 @@ def _at_scale(
 
 def _sorted(parts: list[Centroids], s: DetectionSettings) -> Centroids:
     """All parts, the largest flux first, each star once."""
-    whole = Centroids(**{f: np.concatenate([getattr(p, f) for p in parts]) for f in vars(parts[0])})
-    whole = whole.take(np.argsort(-whole.flux, kind="stable"))
-    return whole.take(_alone(whole)[: s.max_stars])
+    whole = parts[0]
+    if len(parts) > 1:
+        whole = Centroids(**{f: np.concatenate([getattr(p, f) for p in parts]) for f in vars(parts[0])})
+    order = np.argsort(-whole.flux, kind="stable")
+    first = _alone(whole.x_px[order], whole.y_px[order], whole.flux[order])
+    return whole.take(order[first[: s.max_stars]])
 
 
 def _at_all_scales(
@@ -321,7 +324,7 @@ def _merged(found: list[tuple[np.ndarray, ...]], s: DetectionSettings) -> tuple[
     library = kernels()
     if library is not None:
         apart = np.empty(len(order), bool)
-        _declared(library).helmstar_apart(*(a.ctypes.data for a in (x, y, reach)), len(order), apart.ctypes.data)
+        _declared(library).helmstar_apart(*(address(a) for a in (x, y, reach)), len(order), address(apart))
         first = order[apart][: 5 * s.max_stars // 4]
         return tuple(c[first] for c in merged)
     near = np.abs(x[:, None] - x) <= reach  # of the stronger one, in the columns
@@ -343,9 +346,9 @@ def _wider_than_a_pixel(array: np.ndarray, peaks: Peaks, quantum: float) -> np.n
     library = kernels()
     if library is not None and array.dtype in TYPES and array.flags.c_contiguous:
         out = np.empty(len(peaks.x), bool)
-        given = [np.ascontiguousarray(a).ctypes.data for a in (peaks.x, peaks.y, peaks.excess, peaks.noise)]
+        given = [np.ascontiguousarray(a) for a in (peaks.x, peaks.y, peaks.excess, peaks.noise)]
         declared_windows(library).helmstar_wider(
-            array.ctypes.data, TYPES[array.dtype], *array.shape, *given, len(out), quantum, out.ctypes.data
+            address(array), TYPES[array.dtype], *array.shape, *map(address, given), len(out), quantum, address(out)
         )
         return out
     w = around(array, peaks.x, peaks.y, 2)
@@ -415,10 +418,9 @@ def _measure(
     gain = s.gain if s.gain is not None else gain_of(f, w.noise, clear)
     # Noise with a pattern (mosaics, JPEG) is larger in sums of pixels than its pixels say; the filtered image shows it.
     real = np.maximum(w.noise, floor)
-    position, misfit, elongation, peak, saturated = _judged(f, w, real, gain, half)
+    position, misfit, elongation, peak, saturated, star = _judged(f, w, real, gain, half, s)
     position *= np.where(misfit > _MISFIT, misfit, 1.0)[:, None, None]
     position[:, [0, 1], [0, 1]] += (s.optics_px**2 + 0.1**2 * saturated)[:, None]
-    star = _is_star(f, w.noise, half, s)
     if widths is not None:
         widths.append(f.sigma[star])
     everything = Centroids(
@@ -428,35 +430,49 @@ def _measure(
     return everything.take(star)
 
 
-def _judged(f: Fit, w: Windows, real: np.ndarray, gain: float, half: int) -> tuple[np.ndarray, ...]:
-    """Of each fit: covariance (n, 2, 2) of its place from noise and light, chi-square of a pixel, elongation, peak, saturated."""
+def _judged(
+    f: Fit, w: Windows, real: np.ndarray, gain: float, half: int, s: DetectionSettings
+) -> tuple[np.ndarray, ...]:
+    """Of each fit: covariance (n, 2, 2) of its place from noise and light, chi-square of a pixel, elongation, peak, whether it is
+    saturated, whether it is a star.
+    """
     library = kernels()
     if library is not None and half <= HALF[-1]:
-        return _judged_compiled(_declared(library), f, w, real, gain)
+        return _judged_compiled(_declared(library), f, w, real, gain, s.threshold)
     expected = (real**2).astype(np.float32)[:, None, None] + np.float32(gain) * f.model
     misfit = (np.square(f.residual) / expected).mean(axis=(1, 2))
     peak, saturated = w.above.max(axis=(1, 2)), np.asarray(w.full.any(axis=(1, 2)))
-    return f.place_covariance(real, gain), misfit, _elongation(w.above, f, half), peak, saturated
+    return (
+        f.place_covariance(real, gain),
+        misfit,
+        _elongation(w.above, f, half),
+        peak,
+        saturated,
+        _is_star(f, w.noise, half, s),
+    )
 
 
-def _judged_compiled(library: Any, f: Fit, w: Windows, real: np.ndarray, gain: float) -> tuple[np.ndarray, ...]:
+def _judged_compiled(
+    library: Any, f: Fit, w: Windows, real: np.ndarray, gain: float, threshold: float
+) -> tuple[np.ndarray, ...]:
     """The same by detect.c."""
     n, m, _ = f.model.shape
-    p = np.empty((n, 6))
-    p[:, 0], p[:, 1], p[:, 2], p[:, 3], p[:, 4:] = f.flux, f.sky, f.x, f.y, f.sigma
-    given = [np.ascontiguousarray(a, np.float32) for a in (f.model, f.residual, w.above)]
-    given += [np.ascontiguousarray(w.full, bool), np.ascontiguousarray(f.bread, np.float32)]
-    given += [np.ascontiguousarray(f.light, np.float32), p, np.ascontiguousarray(real, np.float32)]
-    place, told, saturated = np.empty((n, 2, 2)), np.empty((3, n), np.float32), np.empty(n, bool)
-    out = [a.ctypes.data for a in (place, *told, saturated)]
-    library.helmstar_judge(*(a.ctypes.data for a in given), n, m, gain, *out)
-    return place, *told, saturated
+    given = [np.ascontiguousarray(a, np.float32) for a in (f.model, f.residual, w.above, f.bread, f.light, f.sums)]
+    given += [np.ascontiguousarray(a, np.float32) for a in (real, w.noise)]
+    given += [np.ascontiguousarray(w.full, bool), np.ascontiguousarray(f.p, float)]
+    model, residual, above, bread, light, sums, real_at, noise, full, p = (address(a) for a in given)
+    place, told, (saturated, star) = np.empty((n, 2, 2)), np.empty((3, n), np.float32), np.empty((2, n), bool)
+    out = [address(a) for a in (place, *told, saturated, star)]
+    library.helmstar_judge(
+        model, residual, above, full, bread, light, p, sums, real_at, noise, n, m, gain, threshold, *out
+    )
+    return place, *told, saturated, star
 
 
 @cache
 def _declared(library: Any) -> Any:
     """The library with the types of what is called here."""
-    library.helmstar_judge.argtypes = [c_void_p] * 8 + [c_int64, c_int, c_double] + [c_void_p] * 5
+    library.helmstar_judge.argtypes = [c_void_p] * 10 + [c_int64, c_int, c_double, c_double] + [c_void_p] * 6
     for f in (library.helmstar_apart, library.helmstar_alone):
         f.argtypes, f.restype = [c_void_p] * 3 + [c_int64, c_void_p], None
     return library
@@ -493,13 +509,13 @@ def _elongation(above: np.ndarray, f: Fit, half: int) -> np.ndarray:
     return np.sqrt((middle + swing) / np.maximum(middle - swing, 0.02 * middle + 1e-12))
 
 
-def _alone(stars: Centroids) -> np.ndarray:
+def _alone(x: np.ndarray, y: np.ndarray, flux: np.ndarray) -> np.ndarray:
     """Indices of stars that are not a second finding, or an artefact, of a brighter one close by; brightest first."""
-    x, y, flux = stars.x_px.astype(np.float32), stars.y_px.astype(np.float32), stars.flux
+    x, y = x.astype(np.float32), y.astype(np.float32)
     library = kernels()
     if library is not None:
         alone, flux = np.empty(len(x), bool), np.ascontiguousarray(flux, float)
-        _declared(library).helmstar_alone(*(a.ctypes.data for a in (x, y, flux)), len(x), alone.ctypes.data)
+        _declared(library).helmstar_alone(*(address(a) for a in (x, y, flux)), len(x), address(alone))
         return np.flatnonzero(alone)
     i, j = np.divmod(np.flatnonzero(np.abs(x[:, None] - x) < 14.0), max(len(x), 1))
     later = np.flatnonzero((j < i) & (np.abs(y[i] - y[j]) < 14.0))

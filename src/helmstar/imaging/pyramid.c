@@ -124,19 +124,25 @@ FAST int64_t helmstar_peaks(
             for (int64_t x = 0; x < width; x++) low[x] = one[x] < two[x] ? one[x] : two[x];
         }
         for (int64_t start = 1; start < width - 1; start += CHUNK) {
-            const int64_t end = start + CHUNK < width - 1 ? start + CHUNK : width - 1;
-            int any = 0;
-            if (end - start == CHUNK)
-                for (int k = 0; k < CHUNK; k++) any |= here[start + k] > low[start + k];
+            const int some = (int)(width - 1 - start < CHUNK ? width - 1 - start : CHUNK);
+            const float *v = here + start, *l = low + start, *u = above + start, *d = below + start;
+            int any = 0, top[CHUNK];
+            if (some == CHUNK)
+                for (int k = 0; k < CHUNK; k++) any |= v[k] > l[k];
             else
                 any = 1;
             if (!any) continue;
-            for (int64_t x = start; x < end; x++) {
+            any = 0;
+            for (int k = 0; k < some; k++) { /* a plateau has one maximum: its last pixel */
+                top[k] = (v[k] > l[k]) & (v[k] >= v[k - 1]) & (v[k] >= u[k + 1]) & (v[k] >= u[k]) & (v[k] >= u[k - 1]) &
+                         (v[k] > v[k + 1]) & (v[k] > d[k - 1]) & (v[k] > d[k]) & (v[k] > d[k + 1]);
+                any |= top[k];
+            }
+            if (!any) continue;
+            for (int k = 0; k < some; k++) {
+                if (!top[k]) continue;
+                const int64_t x = start + k;
                 const float v = here[x];
-                if (!(v > low[x])) continue;
-                /* a plateau has one maximum: its last pixel */
-                if (!(v >= here[x - 1] && v >= above[x + 1] && v >= above[x] && v >= above[x - 1])) continue;
-                if (!(v > here[x + 1] && v > below[x - 1] && v > below[x] && v > below[x + 1])) continue;
                 float a, b, both[2];
                 const int64_t i = place((double)y, height, tile_rows, &a), j = place((double)x, width, tile_columns, &b);
                 const int64_t down_by = i + 1 < tile_rows ? tile_columns : 0, right = j + 1 < tile_columns ? 1 : 0;

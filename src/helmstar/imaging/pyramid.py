@@ -16,12 +16,12 @@ import numpy as np
 
 from ..native import kernels
 from .background import PER_TILE, grid, mesh_from, mesh_of
-from .windows import TYPES
+from .windows import TYPES, address
 
 TILES = (64, 48, 32)
 """Side of a tile of the sky's mesh at each level, in its own pixels."""
 _BAND = 128
-_ROOM = 4096  # places that are made room for at first
+_ROOM = 1024  # places that are made room for at first
 WEIGHT = 16.0
 """Sum of the filter's weights."""
 _NOISE = 6.0  # root of the sum of their squares: from a pixel's noise to the filtered noise
@@ -48,7 +48,7 @@ def halve(array: np.ndarray) -> np.ndarray:
     out = np.empty((h // 2, w // 2), wide(array))
     library = kernels()
     if library is not None and array.dtype in TYPES and array.flags.c_contiguous:
-        _declared(library).helmstar_halve(array.ctypes.data, TYPES[array.dtype], *array.shape, out.ctypes.data)
+        _declared(library).helmstar_halve(address(array), TYPES[array.dtype], *array.shape, address(out))
         return out
     for i in range(0, h, 2 * _BAND):
         a = array[i : min(i + 2 * _BAND, h), :w]
@@ -123,18 +123,16 @@ def _find_compiled(
     g = grid((h - 2, w - 2), (-(-(h - 2) // stride), -(-(w - 2) // stride)), tile)
     rows, columns = np.multiply(g.rows, stride), np.multiply(g.columns, stride)
     values = np.empty((len(rows), len(columns)), np.float32)
-    image = array.ctypes.data, TYPES[array.dtype], h, w
-    if library.helmstar_filtered_at(
-        *image, rows.ctypes.data, len(rows), columns.ctypes.data, len(columns), values.ctypes.data
-    ):
+    image = address(array), TYPES[array.dtype], h, w
+    if library.helmstar_filtered_at(*image, address(rows), len(rows), address(columns), len(columns), address(values)):
         return None
     mesh = mesh_from(values, g, floor)
     bands, work, room = mesh.bands, np.empty((9, w), np.float32), _ROOM
     while True:
         places, light = np.empty((2, room), int), np.empty((2, room), np.float32)
         found = library.helmstar_peaks(
-            *image, mesh.sky.ctypes.data, mesh.noise.ctypes.data, *mesh.sky.shape, bands.ctypes.data, threshold,
-            work.ctypes.data, room, *(a.ctypes.data for a in (*places, *light)),
+            *image, address(mesh.sky), address(mesh.noise), *mesh.sky.shape, address(bands), threshold,
+            address(work), room, *(address(a) for a in (*places, *light)),
         )  # fmt: skip
         if found <= room:
             return Peaks(places[0, :found], places[1, :found], light[0, :found], light[1, :found])

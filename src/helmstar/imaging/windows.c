@@ -4,6 +4,16 @@
 #include <stdint.h>
 #include <string.h>
 
+#if defined(__linux__)
+#include <features.h>
+#endif
+#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
+#define FAST __attribute__((target_clones("avx2", "default")))
+#else
+#define FAST
+#endif
+#define INLINE static inline __attribute__((always_inline))
+
 #define LANES 8
 #define BORDER 2
 #define MOST_HALF 9
@@ -13,10 +23,10 @@
 
 void helmstar_sort_lanes(float *v, int n);
 
-static int64_t inside(int64_t at, int64_t size) { return at < 0 ? 0 : at >= size ? size - 1 : at; }
+INLINE int64_t inside(int64_t at, int64_t size) { return at < 0 ? 0 : at >= size ? size - 1 : at; }
 
 /* The window (2 half + 1)^2 around a place, edges repeated. */
-static void around(const void *data, int type, int64_t h, int64_t w, int64_t x, int64_t y, int64_t half, float *out) {
+INLINE void around(const void *data, int type, int64_t h, int64_t w, int64_t x, int64_t y, int64_t half, float *out) {
     const int64_t m = 2 * half + 1;
     const int whole = x >= half && x < w - half;
     for (int64_t i = 0; i < m; i++, out += m) {
@@ -56,7 +66,7 @@ static void ring_of(Ring *r, int half) {
 }
 
 /* Whether a place lies on a ridge or at the edge of something large: in_structure of windows.py. */
-static int in_structure(
+INLINE int in_structure(
     const float *ring, const int *sector, int n, const float *above, int half, float sky, float grain) {
     const int m = 2 * half + 1;
     float peak = 0.0f, most[SECTORS];
@@ -86,7 +96,7 @@ static int in_structure(
    sorted pixels where the sky's mean begins and ends and of the noise's low and high, and among the sorted steps that of the grain.
    Out: inner, above (n, m, m), full and filled (n, m, m) bytes, sky, noise, grain, x0, y0 (n,), structure (n,) bytes.
    Returns 0; 1 for what it does not take. */
-int helmstar_windows(
+FAST int helmstar_windows(
     const void *data, int type, int64_t h, int64_t w, const int64_t *x, const int64_t *y, const float *floor, int64_t n, int half,
     float saturated, const int *sector, int ring, const int *at, float *inner, float *above, uint8_t *full, uint8_t *filled,
     float *sky, float *noise, float *grain, float *x0, float *y0, uint8_t *structure) {
@@ -186,7 +196,7 @@ int helmstar_wider(
    and upper quantile among every third pixel, sorted. work: `room` floats, for every pixel and every third of eight windows and for one more window.
    Out: x_out, y_out (n,), excess above the median, noise; excess is NaN where a pixel has no value.
    Returns 0; 1 for what it does not take. */
-int helmstar_near(
+FAST int helmstar_near(
     const void *data, int type, const float *dark, int64_t h, int64_t w, const int64_t *x, const int64_t *y, int64_t n, int reach,
     int side, int times, const int64_t *at, float floor, float *work, int64_t room, int64_t *x_out, int64_t *y_out, float *excess,
     float *noise) {
