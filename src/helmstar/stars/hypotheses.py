@@ -9,6 +9,7 @@ needs only two of the detections to be real and in the table, and what it tolera
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -302,6 +303,19 @@ def _at(x: np.ndarray | None) -> ctypes.c_void_p:
     return ctypes.c_void_p(None if x is None else x.__array_interface__["data"][0])
 
 
+_kept = threading.local()
+
+
+def _scratch(room: int) -> tuple[np.ndarray, ...]:
+    """Room for hypotheses, the last chunk's where it suffices: fresh memory costs more than what is written there."""
+    if getattr(_kept, "room", 0) < room:
+        _kept.room = max(room, 4 * CHUNK)
+        ij, ab = np.empty((_kept.room, 2), dtype=np.int32), np.empty((_kept.room, 2), dtype=np.int32)
+        zero, score = np.empty(_kept.room, dtype=np.float32), np.empty(2 * _kept.room, dtype=np.float32)
+        _kept.arrays = ij, ab, np.empty(_kept.room), zero, score
+    return _kept.arrays
+
+
 class _Compiled:
     """What `_chunk` does, by hypotheses.c; all that a search's chunks share is made ready once."""
 
@@ -313,23 +327,13 @@ class _Compiled:
         self.xy = np.ascontiguousarray(d.xy, dtype=float)
         self.m = None if d.magnitude is None else np.ascontiguousarray(d.magnitude, dtype=np.float32)
         self.mixed = mixed(len(d)).astype(np.int32)
-        self.room = 0
 
     def chunk(self, level: Level, table: Pairs, d: Detections, pairs, first, count, freedom: Freedom, keep: int):
         room = 2 * int(count.sum())
         if room == 0:
             return None
         pairs, first, count = (np.ascontiguousarray(x, dtype=np.int64) for x in (pairs, first, count))
-        if room > self.room:
-            # Kept from chunk to chunk: fresh memory costs more than what is written there.
-            self.room = room
-            self.ij, self.ab = np.empty((room, 2), dtype=np.int32), np.empty((room, 2), dtype=np.int32)
-            self.f, self.zero, self.score = (
-                np.empty(room),
-                np.empty(room, dtype=np.float32),
-                np.empty(2 * room, dtype=np.float32),
-            )
-        ij, ab, f, zero, score = self.ij, self.ab, self.f, self.zero, self.score
+        ij, ab, f, zero, score = _scratch(room)
         n_stars, n = _int(len(self.stars)), len(d)
         h = self.candidates(
             n_stars, _at(self.stars), _int(len(self.first)), _at(self.first), _at(self.second), _int(n), _at(self.xy),
