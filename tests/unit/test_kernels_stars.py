@@ -123,7 +123,7 @@ def test_scores_are_those_of_numpy(seed, false, fov_deg, sigma, told, ranged):
     s = scene(default_sky(), c, np.random.default_rng(seed), stars=8, noise_px=sigma, false=false)
     magnitude = None if told == "nothing" else s.magnitude
     d, _ = prepare(s.xy_px, c, None, magnitude, sigma, 0.4, 0.0 if told == "zero point" else None)
-    freedom = focal_freedom(c, (np.radians(4.0), np.radians(30.0)) if ranged else None, 0.001)
+    freedom = focal_freedom(c, (np.radians(0.9 * fov_deg), np.radians(1.1 * fov_deg)) if ranged else None, 0.001)
     level, part = hypotheses.levels_for(d, freedom, LADDER)[0]
     ours, theirs = chosen(d, freedom, level, part, 200), with_numpy(chosen, d, freedom, level, part, 200)
     assert len(ours) == len(theirs)

@@ -28,7 +28,7 @@ KEPT = 5
 """Hypotheses of each chunk that are screened."""
 DEPTHS = ((BRIGHTEST, 1.0), (BRIGHT, 1.0), (FAINT, 0.15))
 """Pair tables with how probable it is that they lead to a solution which the others miss. The first is for unknown fields."""
-WORTH = tuple(1e-8 * 2.0**k for k in range(10, -1, -1))
+WORTH = tuple(1.2e-8 * 2.0**k for k in range(10, -1, -1))
 """Solutions that a look at one more catalogue pair must promise, from first to last (`hypotheses.Stage`)."""
 WORK = 6_000_000
 """Catalogue pairs, once for each way they are laid, that are looked at before the search gives up, whatever the next promises."""
