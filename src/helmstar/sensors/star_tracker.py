@@ -23,7 +23,7 @@ from ..imaging import Camera, Centroids, DetectionSettings, Image
 from ..imaging.calibrated import Calibrated
 from ..imaging.detect import Optics, detect_near, detect_next
 from ..stars.catalog import Catalog, load_catalog
-from ..stars.doubt import Doubt, identify_uncalibrated, magnitude_of_order, roughened
+from ..stars.doubt import ROUGH_WIDTHS, Doubt, identify_uncalibrated, magnitude_of_order, roughened
 from ..stars.glance import follow, glance
 from ..stars.identify import LIMIT, Identification, identify, matrix_of_quaternion, unit_quaternion
 from ..stars.patterns import Sky
@@ -236,16 +236,22 @@ class StarTracker:
             return refine(found, centroids, camera, self.sky, LensPrior.calibrated(self.known), self.epoch_years), doubt
         if doubt == "field":  # the fit must not lean on a statement that was wrong
             focal_sigma = math.inf
+        floor = ROUGH_WIDTHS * camera.width
         if doubt != "rough":
-            refined = refine(
-                found, centroids, camera, self.sky, LensPrior.uncalibrated(camera, focal_sigma), self.epoch_years
-            )
+            lens = LensPrior.uncalibrated(camera, focal_sigma)
+            refined = refine(found, centroids, camera, self.sky, lens, self.epoch_years)
             if refined.scale < ROUGH_SCALE:
                 return refined, doubt
-        rough = replace(centroids, covariance_px=roughened(centroids.covariance_px, len(centroids), camera.width))
-        magnitude = magnitude_of_order(centroids.flux)
-        lens = LensPrior.rough(camera, focal_sigma)
-        return refine(found, rough, camera, self.sky, lens, self.epoch_years, magnitude), "rough"
+            floor = min(floor, _residual_px(refined))
+        lens, magnitude = LensPrior.rough(camera, focal_sigma), magnitude_of_order(centroids.flux)
+        refined = None
+        for _ in range(2):  # the second time with what the stars are displaced by indeed
+            C = roughened(centroids.covariance_px, len(centroids), floor)
+            places = replace(centroids, covariance_px=C)
+            refined = refine(found, places, camera, self.sky, lens, self.epoch_years, magnitude)
+            floor = min(floor, _residual_px(refined))
+        assert refined is not None
+        return refined, "rough"
 
     def _honest(self, centroids: Centroids) -> Centroids:
         """With the covariances that the calibration found."""
@@ -269,6 +275,11 @@ class StarTracker:
             return camera, (math.radians(low), math.radians(high)), FOCAL_SIGMA
         assert self.fov_deg is not None
         return Camera.from_fov(self.fov_deg, width, height, self.aspect), None, FOCAL_SIGMA
+
+
+def _residual_px(refined: Refined) -> float:
+    """Root mean square of a fit's residuals, px per axis."""
+    return refined.identification.residual_rms * refined.camera.focal_px
 
 
 def observer(julian_date_tt: float) -> tuple[float, np.ndarray]:

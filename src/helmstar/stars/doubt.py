@@ -54,12 +54,12 @@ def magnitude_of_order(flux: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(flux), np.log10(rank) / COUNTS, np.nan)
 
 
-def roughened(sigma_px: float | np.ndarray, count: int, width: int) -> np.ndarray:
-    """Covariances (count, 2, 2) px^2 of places that lens or smear displaced; sigma_px as for `identify`."""
+def roughened(sigma_px: float | np.ndarray, count: int, floor_px: float) -> np.ndarray:
+    """Covariances (count, 2, 2) px^2 of places that lens or smear displaced by `floor_px`, 1 sigma; sigma_px as for `identify`."""
     sigma = np.asarray(sigma_px, dtype=float)
     square = np.eye(2)
     own = sigma if sigma.ndim == 3 else np.broadcast_to(sigma**2, (count,))[:, None, None] * square
-    return own + (ROUGH_WIDTHS * width) ** 2 * square
+    return own + floor_px**2 * square
 
 
 def identify_uncalibrated(
@@ -88,7 +88,7 @@ def identify_uncalibrated(
         return best
     bright = flux if flux is not None else None if magnitude is None else -np.asarray(magnitude, dtype=float)
     order = None if bright is None else magnitude_of_order(bright)
-    C = roughened(sigma_px, len(xy_px), camera.size_px[0])
+    C = roughened(sigma_px, len(xy_px), ROUGH_WIDTHS * camera.size_px[0])
     # The brightest alone first: noise of a clipped sky makes many false stars, all of them faint.
     for count in (BRIGHTEST_FEW, len(xy_px)):
         few = np.arange(len(xy_px)) if order is None else np.argsort(order, kind="stable")[:count]
