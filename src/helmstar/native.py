@@ -11,7 +11,9 @@ import os
 import zlib
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+import numpy as np
 
 ROOT = Path(__file__).parent
 
@@ -33,4 +35,11 @@ def kernels() -> Any | None:
     return library if made_of == value else None
 
 
-__all__ = ["kernels"]
+def address(array: np.ndarray) -> int:
+    """Of a contiguous array's first number, in a third of the time that `array.ctypes` takes: there are dozens a frame."""
+    if array.size and array.flags.writeable:
+        return ctypes.addressof(ctypes.c_char.from_buffer(cast(Any, array)))
+    return array.ctypes.data
+
+
+__all__ = ["address", "kernels"]

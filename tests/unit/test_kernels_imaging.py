@@ -21,7 +21,10 @@ from helmstar.imaging.windows import windows
 from helmstar.native import kernels
 
 UP = np.array([0.0, 0.0, 0.0, 1.0])
-MODULES = [import_module(f"helmstar.imaging.{m}") for m in ("background", "centroid", "detect", "pyramid", "windows")]
+MODULES = [
+    import_module(f"helmstar.imaging.{m}")
+    for m in ("background", "centroid", "detect", "measure", "pyramid", "windows")
+]
 TYPES = (np.uint8, np.uint16, np.float32)
 # Both work in single precision, in another order of sums: a centre in a window of some pixels is then known to some 1e-6 px, and
 # the least sigma is about 1e-3 px.

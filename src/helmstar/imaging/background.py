@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..native import kernels
-from .windows import address
+from ..native import address, kernels
 
 PER_TILE = 12
 """Samples along the side of a tile."""

@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ..native import kernels
-from .windows import address
+from ..native import address, kernels
 
 ITERATIONS = 6
 MIN_SIGMA = 0.3

@@ -7,68 +7,26 @@ A place is no star if its light is one pixel's (hot pixel) or one row's or colum
 from __future__ import annotations
 
 from collections.abc import Sequence
-from ctypes import c_double, c_int, c_int64, c_void_p
-from dataclasses import dataclass
+from ctypes import c_int64, c_void_p
 from functools import cache
 from typing import Any
 
 import numpy as np
 
-from ..native import kernels
+from ..native import address, kernels
 from .background import between, mesh_of
-from .centroid import Fit, fit, gain_of
 from .frame import Centroids, Image
+from .measure import BRIGHT, measure, nothing, width_of
 from .pyramid import TILES, Peaks, find_peaks, halve
-from .windows import TYPES, Windows, address, around, windows
+from .settings import HALF, DetectionSettings, Optics
+from .windows import TYPES, around
 from .windows import declared as declared_windows
 
-HALF = (3, 5, 9)
-"""Half the side of a star's window at each level, px."""
-_BRIGHT = 15.0
-_MISFIT = 1.5  # chi-square per pixel above which the model, not noise, is what is wrong
 _COARSE = 1.8  # px; optics broader than this need the coarsest level
 _FEW = 6  # stars; fewer do not confirm what is believed of the optics
-_FILLS, _WELL = 0.85, 0.8  # widest sigma, over half the window, of a star that explains so much of it
-_FULL = 9  # px
+_FULL = 9  # pixels at the limit that the fit fills in a window as wide as the optics need
 _SAME = 0.2  # of the logarithm of the width
-_FOR_WIDTH = 24  # stars whose widths tell the optics
 _WEIGHTS = np.pad(np.outer([1, 2, 1], [1, 2, 1]), 1).astype(np.float32).ravel()
-_WIDTH = (0.8, 1.5, 3.0)  # sigma expected of a star found at each level, px
-
-
-@dataclass(frozen=True)
-class DetectionSettings:
-    """threshold: sigma of the filtered image. max_stars: kept, the brightest. levels: 1 to 3 scales, each twice the one before.
-
-    optics_px: least sigma of a centroid, for what no noise explains (optics are no Gaussians). gain: image counts per
-    photo-electron; None estimates it from the stars' residuals.
-    """
-
-    threshold: float = 5.0
-    max_stars: int = 100
-    levels: int = 3
-    optics_px: float = 0.05
-    gain: float | None = None
-
-    def __post_init__(self) -> None:
-        if not 2.0 <= self.threshold <= 100.0:
-            raise ValueError(f"threshold {self.threshold}: must be 2 to 100 sigma")
-        if not 1 <= self.levels <= 3:
-            raise ValueError(f"levels {self.levels}: must be 1, 2 or 3")
-        if not 1 <= self.max_stars <= 10_000:
-            raise ValueError(f"max_stars {self.max_stars}: must be 1 to 10000")
-
-
-@dataclass(frozen=True)
-class Optics:
-    """What one frame tells of the next by the same camera: sigma of the stars along x and y, px."""
-
-    width: tuple[float, float]
-
-    @property
-    def level(self) -> int:
-        """The scale at which such stars show best."""
-        return int(np.argmin(np.abs(np.log(np.array(_WIDTH) ** 2 / np.prod(self.width)))))
 
 
 def detect(image: Image, settings: DetectionSettings | None = None, dark: np.ndarray | None = None) -> Centroids:
@@ -93,7 +51,7 @@ def detect_next(
     s = settings or DetectionSettings()
     array, quantum = _prepared(image, dark)
     if min(array.shape) < 16:
-        return _nothing(), None
+        return nothing(), None
     if optics is not None and optics.level < s.levels and min(array.shape) >> optics.level >= 40:
         found = _at_scale(array, image, optics, s, quantum)
         if found is not None:
@@ -113,7 +71,7 @@ def detect_near(
     inside = (xy_px >= 0).all(axis=1) & (xy_px[:, 0] < width) & (xy_px[:, 1] < height)
     at = np.rint(xy_px[inside]).astype(int)
     if not len(at) or min(height, width) < 16:
-        return _nothing()
+        return nothing()
     level = optics.level
     reach, quantum = int(np.ceil(reach_px)), _quantum(image)
     side = reach + 2 + (3 << level)
@@ -123,7 +81,7 @@ def detect_near(
     _, first = np.unique(y[good] * width + x[good], return_index=True)
     keep = np.flatnonzero(good)[first]
     if not keep.size:
-        return _nothing()
+        return nothing()
     array = image.array
     if dark is not None:  # only the windows matter, but they are read from one array
         array = array.astype(np.float32) - dark
@@ -131,7 +89,7 @@ def detect_near(
     order = np.argsort(-snr, kind="stable")
     keep, snr = keep[order], snr[order]
     return _sorted(
-        [_measure(array, image, x[keep], y[keep], snr, noise[keep], level, np.array(optics.width), s, quantum)], s
+        [measure(array, image, x[keep], y[keep], snr, noise[keep], level, np.array(optics.width), s, quantum)], s
     )
 
 
@@ -216,10 +174,10 @@ def _at_scale(
     parts, widths = [], []
     for k, mine in ((level, ~full), (min(level + 1, 2), full)):
         if mine.any():
-            parts.append(_measure(array, image, x[mine], y[mine], snr[mine], floor[mine], k, width, s, quantum, widths))
+            parts.append(measure(array, image, x[mine], y[mine], snr[mine], floor[mine], k, width, s, quantum, widths))
     if not len(parts[0]) or sum(map(len, parts)) < _FEW:
         return None
-    bright = parts[0].snr > _BRIGHT
+    bright = parts[0].snr > BRIGHT
     if bright.any() and not (np.abs(np.log(np.median(widths[0][bright], axis=0) / width)) < _SAME).all():
         return None
     return _sorted(parts, s)
@@ -251,21 +209,21 @@ def _at_all_scales(
             binned = halve(binned)
             continue
         places = _merged(found, s)
-        width = _optics(array, image, *places[:4])
+        width = width_of(array, image, *places[:4])
         if width is not None and width.max() < _COARSE:  # sharp stars: the coarsest level would show only structure
             break
         if k + 1 < s.levels:
             binned = halve(binned)
     if not found:
-        return _nothing(), None
+        return nothing(), None
     x, y, level, snr, floor = places or _merged(found, s)
     if not len(x):
-        return _nothing(), None
+        return nothing(), None
     optics = None if width is None else Optics((float(width[0]), float(width[1])))
     if optics is not None:
         # A faint star shows best at the scale of the optics: what only a coarser one sees is structure, unless it is bright.
         best = optics.level
-        keep = (level <= best) | (snr > _BRIGHT)
+        keep = (level <= best) | (snr > BRIGHT)
         x, y, level, snr, floor = (c[keep] for c in (x, y, level, snr, floor))
         # A window as wide as the optics need; a wider one only for what is full, whose light reaches farther.
         full = array[y, x] >= 0.98 * image.saturation
@@ -274,8 +232,8 @@ def _at_all_scales(
     for k in range(s.levels):
         mine = np.flatnonzero(level == k)
         if mine.size:
-            parts.append(_measure(array, image, x[mine], y[mine], snr[mine], floor[mine], k, width, s, quantum))
-    return (_sorted(parts, s) if parts else _nothing()), optics
+            parts.append(measure(array, image, x[mine], y[mine], snr[mine], floor[mine], k, width, s, quantum))
+    return (_sorted(parts, s) if parts else nothing()), optics
 
 
 def dark_of(images: Sequence[Image]) -> np.ndarray:
@@ -293,11 +251,6 @@ def dark_of(images: Sequence[Image]) -> np.ndarray:
     grid = np.arange(shape[0]), np.arange(shape[1])
     rise = middle - between(mesh.sky, shape, *grid)
     return np.where(rise > 6.0 * between(mesh.noise, shape, *grid), rise, np.float32(0.0))
-
-
-def _nothing() -> Centroids:
-    n = np.zeros(0)
-    return Centroids(n, n, n, np.zeros((0, 2, 2)), n, n.astype(bool), n, n)
 
 
 def _candidates(
@@ -383,130 +336,12 @@ def _brightest_of(array: np.ndarray, peaks: Peaks, level: int, threshold: float)
     return x, y, without > 0.7 * threshold * peaks.noise
 
 
-def _optics(
-    array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, level: np.ndarray, snr: np.ndarray
-) -> np.ndarray | None:
-    """Sigma (2,) of the optics along x and y, px, from the brightest places that are not saturated; None where too few say."""
-    some = np.flatnonzero((snr > _BRIGHT) & (level < 2))[:_FOR_WIDTH]
-    if some.size < 3:
-        return None
-    w = windows(array, image, x[some], y[some], HALF[1], 1e-9)
-    clear = ~w.filled.any(axis=(1, 2)) & ~w.structure
-    if clear.sum() < 3:
-        return None
-    f = fit(w.inner[clear], w.x0[clear], w.y0[clear], w.sky[clear], w.noise[clear], np.ones(2), w.filled[clear], 0.5, 4)
-    return np.median(f.sigma, axis=0)
-
-
-def _measure(
-    array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, snr: np.ndarray, floor: np.ndarray, level: int,
-    width: np.ndarray | None, s: DetectionSettings, quantum: float, widths: list[np.ndarray] | None = None,
-) -> Centroids:  # fmt: skip
-    """Fit the places of one level and keep those that are stars. widths: gets the fitted sigmas (n, 2) of these."""
-    half = HALF[level]
-    rounding = quantum / np.sqrt(12.0)
-    w = windows(array, image, x, y, half, np.minimum(floor, rounding))
-    calm = np.flatnonzero(~w.structure)
-    if not calm.size:
-        return _nothing()
-    if calm.size < len(x):
-        x, y, snr, floor = x[calm], y[calm], snr[calm], floor[calm]
-        w = Windows(**{k: v[calm] for k, v in vars(w).items()})
-    expected = np.full(2, _WIDTH[level]) if width is None else width
-    f = fit(w.inner, w.x0, w.y0, w.sky, w.noise, expected, w.filled, 0.25 if width is not None else 0.35)
-    clear = (snr > _BRIGHT) & ~w.filled.any(axis=(1, 2))
-    gain = s.gain if s.gain is not None else gain_of(f, w.noise, clear)
-    # Noise with a pattern (mosaics, JPEG) is larger in sums of pixels than its pixels say; the filtered image shows it.
-    real = np.maximum(w.noise, floor)
-    position, misfit, elongation, peak, saturated, star = _judged(f, w, real, gain, half, s)
-    position *= np.where(misfit > _MISFIT, misfit, 1.0)[:, None, None]
-    position[:, [0, 1], [0, 1]] += (s.optics_px**2 + 0.1**2 * saturated)[:, None]
-    if widths is not None:
-        widths.append(f.sigma[star])
-    everything = Centroids(
-        x_px=x + f.x, y_px=y + f.y, flux=f.flux, covariance_px=position, peak=peak, saturated=saturated,
-        elongation=elongation, snr=snr,
-    )  # fmt: skip
-    return everything.take(star)
-
-
-def _judged(
-    f: Fit, w: Windows, real: np.ndarray, gain: float, half: int, s: DetectionSettings
-) -> tuple[np.ndarray, ...]:
-    """Of each fit: covariance (n, 2, 2) of its place from noise and light, chi-square of a pixel, elongation, peak, whether it is
-    saturated, whether it is a star.
-    """
-    library = kernels()
-    if library is not None and half <= HALF[-1]:
-        return _judged_compiled(_declared(library), f, w, real, gain, s.threshold)
-    expected = (real**2).astype(np.float32)[:, None, None] + np.float32(gain) * f.model
-    misfit = (np.square(f.residual) / expected).mean(axis=(1, 2))
-    peak, saturated = w.above.max(axis=(1, 2)), np.asarray(w.full.any(axis=(1, 2)))
-    return (
-        f.place_covariance(real, gain),
-        misfit,
-        _elongation(w.above, f, half),
-        peak,
-        saturated,
-        _is_star(f, w.noise, half, s),
-    )
-
-
-def _judged_compiled(
-    library: Any, f: Fit, w: Windows, real: np.ndarray, gain: float, threshold: float
-) -> tuple[np.ndarray, ...]:
-    """The same by detect.c."""
-    n, m, _ = f.model.shape
-    given = [np.ascontiguousarray(a, np.float32) for a in (f.model, f.residual, w.above, f.bread, f.light, f.sums)]
-    given += [np.ascontiguousarray(a, np.float32) for a in (real, w.noise)]
-    given += [np.ascontiguousarray(w.full, bool), np.ascontiguousarray(f.p, float)]
-    model, residual, above, bread, light, sums, real_at, noise, full, p = (address(a) for a in given)
-    place, told, (saturated, star) = np.empty((n, 2, 2)), np.empty((3, n), np.float32), np.empty((2, n), bool)
-    out = [address(a) for a in (place, *told, saturated, star)]
-    library.helmstar_judge(
-        model, residual, above, full, bread, light, p, sums, real_at, noise, n, m, gain, threshold, *out
-    )
-    return place, *told, saturated, star
-
-
 @cache
 def _declared(library: Any) -> Any:
     """The library with the types of what is called here."""
-    library.helmstar_judge.argtypes = [c_void_p] * 10 + [c_int64, c_int, c_double, c_double] + [c_void_p] * 6
     for f in (library.helmstar_apart, library.helmstar_alone):
         f.argtypes, f.restype = [c_void_p] * 3 + [c_int64, c_void_p], None
     return library
-
-
-def _is_star(f: Fit, noise: np.ndarray, half: int, s: DetectionSettings) -> np.ndarray:
-    """Which fits look like a star: centred, neither a pixel nor a plane, and more light than the roughness around them."""
-    wide, narrow = f.sigma.max(axis=1), f.sigma.min(axis=1)
-    light = f.sums[:, 1]
-    explained = light / (light + f.sums[:, 2])
-    # At the coarsest level nothing wider is tried: a smeared or badly focused star may fill the window if little else does.
-    wider = (wide < _FILLS * half) & (explained > _WELL) if half == HALF[-1] else False
-    return (
-        (f.flux > 0.6 * s.threshold * noise * np.sqrt(4 * np.pi * wide * narrow))
-        & (np.maximum(np.abs(f.x), np.abs(f.y)) < 0.6 * half)
-        & ((wide < 0.6 * half) | wider)
-        & (explained > 0.4)
-    )
-
-
-def _elongation(above: np.ndarray, f: Fit, half: int) -> np.ndarray:
-    """Longer over shorter axis (n,) of the light's second moments under a window of twice its width."""
-    d = np.arange(-half, half + 1, dtype=np.float32)
-    away = d - np.stack([f.x, f.y])[:, :, None].astype(np.float32)
-    reach = (2.0 * f.sigma.max(axis=1) + 0.5).astype(np.float32)
-    basis = np.empty((2, len(f.x), 3, d.size), np.float32)  # the window's weight along x and y, times 1, d, d^2
-    basis[:, :, 0] = np.exp(np.float32(-0.5) * np.square(away / reach[:, None]))
-    np.multiply(basis[:, :, 0], away, out=basis[:, :, 1])
-    np.multiply(basis[:, :, 1], away, out=basis[:, :, 2])
-    moments = basis[1] @ above @ basis[0].transpose(0, 2, 1)
-    total = moments[:, 0, 0] + 1e-12
-    xx, yy, xy = moments[:, 0, 2] / total, moments[:, 2, 0] / total, moments[:, 1, 1] / total
-    middle, swing = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-    return np.sqrt((middle + swing) / np.maximum(middle - swing, 0.02 * middle + 1e-12))
 
 
 def _alone(x: np.ndarray, y: np.ndarray, flux: np.ndarray) -> np.ndarray:
@@ -527,4 +362,4 @@ def _alone(x: np.ndarray, y: np.ndarray, flux: np.ndarray) -> np.ndarray:
     return np.flatnonzero(keep)
 
 
-__all__ = ["HALF", "DetectionSettings", "Optics", "dark_of", "detect", "detect_near", "detect_next"]
+__all__ = ["DetectionSettings", "Optics", "dark_of", "detect", "detect_near", "detect_next"]

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from ..native import kernels
+from ..native import address, kernels
 from .background import PER_TILE, grid, mesh_from, mesh_of
-from .windows import TYPES, address
+from .windows import TYPES
 
 TILES = (64, 48, 32)
 """Side of a tile of the sky's mesh at each level, in its own pixels."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from ctypes import addressof, c_char, c_float, c_int, c_int64, c_void_p
+from ctypes import c_float, c_int, c_int64, c_void_p
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from ..native import kernels
+from ..native import address, kernels
 from .frame import Image
 
 BORDER = 2
@@ -94,13 +94,6 @@ def windows(
 
 TYPES = {np.dtype(np.uint8): 0, np.dtype(np.uint16): 1, np.dtype(np.float32): 2}
 """Numbers by which the C sources know an image's type."""
-
-
-def address(array: np.ndarray) -> int:
-    """Of a contiguous array's first number, in a third of the time that `array.ctypes` takes: there are dozens a frame."""
-    if array.size and array.flags.writeable:
-        return addressof(c_char.from_buffer(cast(Any, array)))
-    return array.ctypes.data
 
 
 def _windows_compiled(
@@ -201,4 +194,4 @@ def _in_structure(above: np.ndarray, ring: np.ndarray, sky: np.ndarray, grain: n
     return ridge | ((np.abs(mean) > (0.2 * peak + grain)[:, None]).sum(axis=1) >= 3)
 
 
-__all__ = ["BORDER", "TYPES", "Windows", "address", "around", "declared", "windows"]
+__all__ = ["BORDER", "TYPES", "Windows", "around", "declared", "windows"]
