@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import sysconfig
 import zlib
 from pathlib import Path
 from typing import Any
@@ -63,5 +64,6 @@ class KernelsHook(BuildHookInterface):
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         if compile_kernels(Path(self.root) / "src" / "helmstar") is not None:
             build_data["pure_python"] = False
-            build_data["infer_tag"] = True
+            # Plain C through ctypes: tied to the machine, not to one Python.
+            build_data["tag"] = "py3-none-" + sysconfig.get_platform().replace("-", "_").replace(".", "_")
             build_data["artifacts"].append("src/helmstar/_kernels.so")
