@@ -18,6 +18,8 @@ catalogue place of unknown epoch is uncertain by its proper motion.
 
 from __future__ import annotations
 
+import ctypes
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +27,7 @@ import numpy as np
 from ..imaging import Camera, Centroids
 from ..imaging.calibrate import Calibration, derivative
 from ..imaging.calibrated import Calibrated
+from ..native import address, kernels
 from ..stars.glance import quaternion_of
 from ..stars.identify import Identification, matrix_of_quaternion
 from ..stars.patterns import Sky
@@ -44,6 +47,8 @@ STILL_PX = 0.03
 """Steps that move no star farther are the last: what the linear problem leaves is of their second order."""
 BENT_PX = 0.01
 """Bound on what the linear problem leaves, a third of it at most in truth, below which a step is the last as well."""
+ASTRAY = 2.0
+"""Factor between focal lengths, before and after, from which a fit of wrong matches has run away."""
 _STEPS = 4
 _MATCHINGS = 2
 _LEAST = 3
@@ -117,77 +122,67 @@ def refine(
     """Fit attitude and lens to all stars that match, from a solved identification.
 
     camera: as the identification took it. epoch_years: 1 sigma of the time from the sky's year to the image. magnitude: (n,)
-    of the centroids, that of their flux by default. Where fewer than three stars match, the identification stays as it is.
+    of the centroids, that of their flux by default. Where fewer than three stars match, or the fit runs away, the identification stays as it is.
     """
-    lens = _Lens.of(camera, prior)
-    R, p = matrix_of_quaternion(found.q_SN), np.array([np.log(found.focal_px / camera.focal_px), 0.0, 0.0, 0.0])
+    R = matrix_of_quaternion(found.q_SN)
     if magnitude is None:
         magnitude = -2.5 * np.log10(np.maximum(centroids.flux, 1e-12))
     zero = middle(sky.magnitude[found.stars] - magnitude[found.detections])
-    near = _in_view(sky, R, camera, found.focal_px)
-    near = near[sky.magnitude[near] < zero + float(magnitude.max()) + magnitude_gate]
-    at = np.minimum(np.searchsorted(near, found.stars), len(near) - 1)
+    near, d_N, V = _in_view(sky, R, camera, found.focal_px, zero + float(magnitude.max()) + magnitude_gate)
+    at = np.minimum(near.searchsorted(found.stars), len(near) - 1)
     good = near[at] == found.stars if len(near) else np.zeros(len(at), bool)
     i, j = at[good], found.detections[good]
     if len(i) < _LEAST:
         return Refined(found, replace(camera, focal_px=found.focal_px), 1.0)
-    xy, C = centroids.xy_px, centroids.covariance_px
     drift = epoch_years * found.focal_px * np.hypot(sky.catalog.pm_ra[near], sky.catalog.pm_dec[near])
-    spread = lambda i, j: C[j] + drift[i, None, None] ** 2 * lens.round  # noqa: E731
-    agree = np.abs(sky.magnitude[near][:, None] - magnitude - zero) < magnitude_gate
-    density = len(xy) / (camera.width * camera.height)
-    d_N, best, residual = sky.directions[near], None, np.zeros((0, 2))
-    for _ in range(_STEPS):
-        predicted, J = lens.predict(R, p, d_N)
-        best = None if best is None else replace(best, delta=np.zeros(7))
-        best = _settle(J[i], xy[j] - predicted[i], spread(i, j), lens.prior(p), 2 if best is None else 1, best)
-        for _ in range(_MATCHINGS):
-            k, m, gain = _matched(predicted + best.moved(J), J, best, xy, C, drift, agree, density)
-            few = len(k) < max(_LEAST, len(i) // 2)
-            k, m = (v[: _depth(gain, k, len(xy))] for v in (k, m))
-            same = len(k) == len(i) and bool((k == i).all() and (m == j).all())
-            if same or few or len(k) < _LEAST:
-                break
-            i, j = k, m
-            best = _settle(J[i], xy[j] - predicted[i], spread(i, j), lens.prior(p), 2, best)
-        R, p = turn(best.delta[:3], R), p + best.delta[3:]
-        moved = best.moved(J[i])
-        residual = xy[j] - predicted[i] - moved
-        if lens.second_order(best.delta) < BENT_PX or float(np.abs(moved).max()) < STILL_PX:
-            break
-    assert best is not None
-    order = np.argsort(j, kind="stable")
-    i, j, residual = i[order], j[order], residual[order]
-    focal = camera.focal_px * float(np.exp(p[0]))
-    try:
-        fitted = replace(
-            camera, focal_px=focal, distortion=(camera.distortion[0] + float(p[3]), *camera.distortion[1:])
-        )
-    except ValueError:  # a distortion that folds the corners over, where no star was seen
-        fitted = replace(camera, focal_px=focal)
-    q_SN, z = quaternion_of(R), R[2]
-    mounted = found.q_BN is not found.q_SN
-    R_BS = matrix_of_quaternion(found.q_BN) @ matrix_of_quaternion(found.q_SN).T if mounted else None
-    better = replace(
-        found, q_SN=q_SN, q_BN=q_SN if R_BS is None else quaternion_of(R_BS @ R),
-        covariance=best.covariance[:3, :3], stars=near[i], detections=j, hip=sky.catalog.hip[near[i]],
-        residuals_px=residual * [1.0, camera.aspect], focal_px=focal,
-        residual_rms=float(np.sqrt(np.mean((residual * [1.0, camera.aspect]) ** 2)) / focal),
-        ra=float(np.arctan2(z[1], z[0]) % (2.0 * np.pi)), dec=float(np.arcsin(np.clip(z[2], -1.0, 1.0))),
-        roll=float(np.arctan2(-R[0, 2], -R[1, 2]) % (2.0 * np.pi)),
+    density = len(centroids) / (camera.width * camera.height)
+    problem = _Problem(
+        _Lens.of(camera, prior), d_N, V, drift, centroids.xy_px, centroids.covariance_px, magnitude, zero, magnitude_gate,
+        density,
     )  # fmt: skip
-    return Refined(better, fitted, best.scale)
+    p, library = np.array([np.log(found.focal_px / camera.focal_px), 0.0, 0.0, 0.0]), kernels()
+    fit = _fit(problem, R, p, i, j) if library is None else _compiled(library, problem, R, p, i, j)
+    if not abs(fit.p[0] - p[0]) < math.log(ASTRAY):  # nor where it is no number
+        return Refined(found, replace(camera, focal_px=found.focal_px), 1.0)
+    order = np.argsort(fit.j, kind="stable")
+    i, j, residual = near[fit.i[order]], fit.j[order], fit.residual[order] * [1.0, camera.aspect]
+    focal = camera.focal_px * float(np.exp(fit.p[0]))
+    q_SN, z = quaternion_of(fit.R), fit.R[2]
+    mounted = found.q_BN is not found.q_SN
+    R_BS = matrix_of_quaternion(found.q_BN) @ R.T if mounted else None
+    better = replace(
+        found, q_SN=q_SN, q_BN=q_SN if R_BS is None else quaternion_of(R_BS @ fit.R),
+        covariance=fit.covariance[:3, :3], stars=i, detections=j, hip=sky.catalog.hip[i], residuals_px=residual,
+        focal_px=focal, residual_rms=math.sqrt(float(np.square(residual).mean())) / focal,
+        ra=math.atan2(z[1], z[0]) % (2.0 * math.pi), dec=math.asin(max(-1.0, min(1.0, z[2]))),
+        roll=math.atan2(-fit.R[0, 2], -fit.R[1, 2]) % (2.0 * math.pi),
+    )  # fmt: skip
+    return Refined(better, _with(camera, focal, float(fit.p[3])), fit.scale)
 
 
-def _in_view(sky: Sky, R: np.ndarray, camera: Camera, focal_px: float) -> np.ndarray:
-    """Indices of the stars that a pinhole at R sees on the image and a margin of 4% around it."""
+def _with(camera: Camera, focal_px: float, k1: float) -> Camera:
+    """The camera of another focal length, and k1 added to its own: what of it folds no corner over, where no star was seen."""
+    for distortion in ((camera.distortion[0] + k1, *camera.distortion[1:]), camera.distortion):
+        try:
+            return replace(camera, focal_px=focal_px, distortion=distortion)
+        except ValueError:
+            continue
+    return camera
+
+
+def _in_view(
+    sky: Sky, R: np.ndarray, camera: Camera, focal_px: float, faintest: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Indices (n,) of the stars brighter than `faintest` that a pinhole at R sees on the image and a margin of 4% around it, their
+    directions (n, 3) and their V."""
     half_x, half_y = 0.54 * camera.width / focal_px, 0.54 * camera.height * camera.aspect / focal_px
-    near = sky.around(R[2], float(np.arctan(np.hypot(half_x, half_y))))
-    v = sky.directions[near] @ R.T
+    near = sky.around(R[2], math.atan(math.hypot(half_x, half_y)))
+    d_N, V = sky.directions.take(near, axis=0), sky.magnitude.take(near)
+    x, y, z = R @ d_N.T
     off_x = (0.5 * (camera.width - 1) - camera.cx) / focal_px
     off_y = (0.5 * (camera.height - 1) - camera.cy) * camera.aspect / focal_px
-    z = v[:, 2]
-    return near[(np.abs(v[:, 0] - off_x * z) < half_x * z) & (np.abs(v[:, 1] - off_y * z) < half_y * z)]
+    seen = np.flatnonzero((np.abs(x - off_x * z) < half_x * z) & (np.abs(y - off_y * z) < half_y * z) & (faintest > V))
+    return near.take(seen), d_N.take(seen, axis=0), V.take(seen)
 
 
 @dataclass(frozen=True)
@@ -201,9 +196,9 @@ class _Lens:
 
     @classmethod
     def of(cls, camera: Camera, prior: LensPrior) -> _Lens:
-        sigma = np.array([prior.focal, prior.centre_px, prior.centre_px / camera.aspect, prior.k1])
-        known = np.concatenate([np.zeros(3), 1.0 / np.maximum(sigma, 1e-9) ** 2])
-        return cls(camera, known, np.diag([1.0, camera.aspect**-2]))
+        sigma = (prior.focal, prior.centre_px, prior.centre_px / camera.aspect, prior.k1)
+        known = np.array([0.0, 0.0, 0.0, *(1.0 / max(s, 1e-9) ** 2 for s in sigma)])
+        return cls(camera, known, np.array([[1.0, 0.0], [0.0, camera.aspect**-2]]))
 
     def predict(self, R: np.ndarray, p: np.ndarray, d_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pixels (n, 2) of directions, and their derivative (n, 2, 7) by theta, ln f, e_x, e_y, k1."""
@@ -251,6 +246,107 @@ class _Lens:
     def prior(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Information (7,) of what is known before, and its gradient (7,) at p."""
         return self.known, -self.known * np.concatenate([np.zeros(3), p])
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Stars: directions (n, 3), V (n,), and drift (n,), px, by which they may have moved, the brightest first. Detections: xy
+    (m, 2) and covariance (m, 2, 2), px, magnitude (m,), which with `zero` is V to `magnitude_gate`, and density, 1/px^2."""
+
+    lens: _Lens
+    directions: np.ndarray
+    V: np.ndarray
+    drift: np.ndarray
+    xy: np.ndarray
+    covariance: np.ndarray
+    magnitude: np.ndarray
+    zero: float
+    magnitude_gate: float
+    density: float
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """R (3, 3) and p (4,), the covariance (7, 7) of both, the scale, and the matches i, j (k,) with their residuals (k, 2), px."""
+
+    R: np.ndarray
+    p: np.ndarray
+    covariance: np.ndarray
+    scale: float
+    i: np.ndarray
+    j: np.ndarray
+    residual: np.ndarray
+
+
+def _fit(q: _Problem, R: np.ndarray, p: np.ndarray, i: np.ndarray, j: np.ndarray) -> _Fit:
+    """Gauss and Newton's steps from R, p and the matches i, j, which are looked for again at each."""
+    lens, xy, C, drift, best = q.lens, q.xy, q.covariance, q.drift, None
+    spread = lambda i, j: C[j] + drift[i, None, None] ** 2 * lens.round  # noqa: E731
+    agree = np.abs(q.V[:, None] - q.magnitude - q.zero) < q.magnitude_gate
+    residual = np.zeros((0, 2))
+    for _ in range(_STEPS):
+        predicted, J = lens.predict(R, p, q.directions)
+        best = None if best is None else replace(best, delta=np.zeros(7))
+        best = _settle(J[i], xy[j] - predicted[i], spread(i, j), lens.prior(p), 2 if best is None else 1, best)
+        for _ in range(_MATCHINGS):
+            k, m, gain = _matched(predicted + best.moved(J), J, best, xy, C, drift, agree, q.density)
+            few = len(k) < max(_LEAST, len(i) // 2)
+            depth = _depth(gain, k, len(xy))
+            k, m = k[:depth], m[:depth]
+            same = len(k) == len(i) and bool((k == i).all() and (m == j).all())
+            if same or few or len(k) < _LEAST:
+                break
+            i, j = k, m
+            best = _settle(J[i], xy[j] - predicted[i], spread(i, j), lens.prior(p), 2, best)
+        R, p = turn(best.delta[:3], R), p + best.delta[3:]
+        moved = best.moved(J[i])
+        residual = xy[j] - predicted[i] - moved
+        if lens.second_order(best.delta) < BENT_PX or float(np.abs(moved).max()) < STILL_PX:
+            break
+    assert best is not None
+    return _Fit(R, p, best.covariance, best.scale, i, j, residual)
+
+
+class _InC(ctypes.Structure):
+    """Problem of refine.c."""
+
+    _fields_ = (
+        [(k, ctypes.c_int64) for k in ("n", "m", "least", "steps", "matchings")]
+        + [(k, ctypes.c_double) for k in ("aspect", "focal", "cx", "cy")]
+        + [("distortion", ctypes.c_double * 5), ("known", ctypes.c_double * 7)]
+        + [(k, ctypes.c_double) for k in ("zero", "magnitude_gate", "density", "gate", "huber", "degrees", "still", "bent")]
+        + [(k, ctypes.c_void_p) for k in ("directions", "V", "drift", "xy", "covariance", "magnitude")]
+    )  # fmt: skip
+
+
+def _compiled(library: ctypes.CDLL, q: _Problem, R: np.ndarray, p: np.ndarray, i: np.ndarray, j: np.ndarray) -> _Fit:
+    """As `_fit`, by refine.c."""
+    n, m, c = len(q.directions), len(q.xy), q.lens.camera
+    arrays = (q.directions, q.V, q.drift, q.xy, q.covariance, q.magnitude)
+    shapes = ((n, 3), (n,), (n,), (m, 2), (m, 2, 2), (m,))
+    if tuple(x.shape for x in arrays) != shapes:
+        raise ValueError(f"stars and detections have the shapes {[x.shape for x in arrays]}, not {list(shapes)}")
+    s = _InC(
+        n, m, _LEAST, _STEPS, _MATCHINGS, c.aspect, c.focal_px, c.cx, c.cy, c.distortion, tuple(q.lens.known.tolist()), q.zero,
+        q.magnitude_gate, q.density, GATE, HUBER, SCALE_DEGREES, STILL_PX, BENT_PX,
+    )  # fmt: skip
+    # One array in and two out, which refine.c divides as here: an array's address takes Python as long as ten stars take C.
+    given, room = np.concatenate([x.ravel() for x in arrays], dtype=float), max(n, len(i))
+    matches, fit = np.empty((2, room), dtype=np.int64), np.empty(70 + 2 * room)
+    matches[0, : len(i)], matches[1, : len(i)] = i, j
+    fit[:9], fit[9:13] = R.ravel(), p
+    call = library.helmstar_refine
+    call.restype = ctypes.c_int64
+    pointers = [ctypes.c_void_p(address(x)) for x in (given, fit, matches)]
+    count = call(ctypes.byref(s), *pointers, ctypes.c_int64(room), ctypes.c_int64(len(i)))
+    if count == -2:
+        raise MemoryError("no room for the last fit")
+    if count < 0:
+        raise IndexError("a match is of a detection that is not in the list")
+    return _Fit(
+        fit[:9].reshape(3, 3), fit[9:13], fit[20:69].reshape(7, 7), float(fit[69]), matches[0, :count], matches[1, :count],
+        fit[70 : 70 + 2 * count].reshape(-1, 2),
+    )  # fmt: skip
 
 
 def _turn_to(x: float, y: float) -> np.ndarray:
