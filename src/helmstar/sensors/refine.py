@@ -66,7 +66,7 @@ class LensPrior:
     @classmethod
     def uncalibrated(cls, camera: Camera, focal: float) -> LensPrior:
         """Of an unknown lens: centred within 2% of the image's width, and 1% of distortion in the corner."""
-        corner = 0.5 * float(np.hypot(camera.width, camera.height * camera.aspect)) / camera.focal_px
+        corner = 0.5 * math.hypot(camera.width, camera.height * camera.aspect) / camera.focal_px
         return cls(focal, 0.02 * camera.width, 0.01 / corner**2)
 
     @classmethod
@@ -80,8 +80,8 @@ class LensPrior:
         """As the calibration says; a camera written by hand is believed to 0.05% of its focal length, 0.2% of its width, and 0.1%
         of distortion in the corner. A focal length follows the temperature: never better than 0.01%."""
         camera = known.camera
-        corner = 0.5 * float(np.hypot(camera.width, camera.height * camera.aspect)) / camera.focal_px
-        focal = 5e-4 if known.focal_sigma_px is None else float(np.hypot(known.focal_sigma_px / camera.focal_px, 1e-4))
+        corner = 0.5 * math.hypot(camera.width, camera.height * camera.aspect) / camera.focal_px
+        focal = 5e-4 if known.focal_sigma_px is None else math.hypot(known.focal_sigma_px / camera.focal_px, 1e-4)
         centre = 0.002 * camera.width if known.centre_sigma_px is None else known.centre_sigma_px
         return cls(focal, centre, 0.001 / corner**2 if known.k1_sigma is None else known.k1_sigma)
 
@@ -122,7 +122,8 @@ def refine(
     """Fit attitude and lens to all stars that match, from a solved identification.
 
     camera: as the identification took it. epoch_years: 1 sigma of the time from the sky's year to the image. magnitude: (n,)
-    of the centroids, that of their flux by default. Where fewer than three stars match, or the fit runs away, the identification stays as it is.
+    of the centroids, that of their flux by default. Where fewer than three stars match, or the fit runs away, the
+    identification stays as it is.
     """
     R = matrix_of_quaternion(found.q_SN)
     if magnitude is None:
