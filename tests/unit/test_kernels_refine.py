@@ -15,7 +15,8 @@ from helmstar.imaging import Camera, Centroids
 from helmstar.imaging.calibrated import Calibrated
 from helmstar.native import kernels
 from helmstar.sensors import refine as last
-from helmstar.sensors.refine import EPOCH_SPREAD_YEARS, LensPrior, refine
+from helmstar.sensors.lens import LensPrior
+from helmstar.sensors.refine import EPOCH_SPREAD_YEARS, refine
 from helmstar.stars import default_sky
 from helmstar.stars.identify import Identification
 
@@ -183,7 +184,7 @@ def test_a_fit_is_the_same_each_time_and_from_arrays_of_any_layout():
 def problem(directions: np.ndarray, **other) -> last._Problem:
     """Stars seen where the camera predicts them, at R = 1."""
     camera, n = Camera.from_fov(12.0, 1024, 768), len(directions)
-    lens = last._Lens.of(camera, LensPrior(np.inf, 20.0, 0.5))
+    lens = last.Lens.of(camera, LensPrior(np.inf, 20.0, 0.5))
     xy = camera.pixels(directions)
     return replace(
         last._Problem(

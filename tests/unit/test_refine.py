@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from helmstar.imaging import Camera, Centroids
 from helmstar.imaging.calibrated import Calibrated
-from helmstar.sensors.refine import LensPrior, _Lens, refine
+from helmstar.sensors.lens import Lens, LensPrior
+from helmstar.sensors.refine import refine
 from helmstar.sensors.star_tracker import StarTracker
 
 NOMINAL = Camera.from_fov(12.0, 1024, 768)
@@ -70,8 +71,8 @@ def test_the_covariance_holds_for_unknown_lenses_and_for_sigmas_that_were_told_t
     # 50 times chi-square of 3: mean 3, one sigma sqrt(6/50) = 0.35. The scale's own error adds a twentieth; the belief in sigmas
     # that were told wrongly and Huber's cut a tenth each where they are 2.5 times too small.
     assert 2.0 < squares.mean() < (4.6 if sigma == 0.1 else 5.5)
-    # Sigmas that were told 2.5 times too small make the camera a rough one, whose displacement of stars then explains the residuals:
-    # 40 stars (some 75 degrees of freedom) against the belief in the sigmas (8), and Huber's cut.
+    # Sigmas that were told 2.5 times too small make the camera a rough one, whose displacement of stars then explains the
+    # residuals: 40 stars (some 75 degrees of freedom) against the belief in the sigmas (8), and Huber's cut.
     assert np.median(scales) == pytest.approx(1.0, rel=0.2)
 
 
@@ -130,7 +131,7 @@ def test_a_calibrated_camera_keeps_its_centre_and_its_smaller_sigma():
 def test_the_derivatives_are_those_of_the_prediction(ln_f, ex, ey, k1, aspect, seed):
     rng = np.random.default_rng(seed)
     camera = Camera(800, 600, 2000.0, (410.0, 290.0), aspect, (-0.1, 0.05, 1e-3, -2e-3, 0.0))
-    it = _Lens.of(camera, LensPrior.uncalibrated(camera, 0.01))
+    it = Lens.of(camera, LensPrior.uncalibrated(camera, 0.01))
     R = Rotation.random(rng=rng).as_matrix()
     d = camera.directions(rng.uniform(0, 600, (5, 2))) @ R
     p = np.array([ln_f, ex, ey, k1])

@@ -88,7 +88,7 @@ static void product(const double *A, const double *B, double *out)
             out[3 * r + c] = A[3 * r] * B[c] + A[3 * r + 1] * B[3 + c] + A[3 * r + 2] * B[6 + c];
 }
 
-/* As `_Lens.predict`, of all stars. */
+/* As `Lens.predict` (lens.py), of all stars. */
 EVERY_MACHINE static void predict(const Problem *q, const Fit *fit, Room *room)
 {
     double a = q->aspect, f = q->focal * exp(fit->p[0]), fa = f / a, ex = fit->p[1], ey = fit->p[2];
@@ -303,7 +303,7 @@ static void turn(const double *theta, double *R)
         R[k] += out[k];
 }
 
-/* As `_Lens.second_order`. */
+/* As `Lens.second_order`. */
 static double second_order(const Problem *q, const double *delta)
 {
     double turned = fabs(delta[0]) + fabs(delta[1]) + fabs(delta[2]), centre = fabs(delta[4]) + fabs(delta[5]);

@@ -25,13 +25,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..imaging import Camera, Centroids
-from ..imaging.calibrate import Calibration, derivative
-from ..imaging.calibrated import Calibrated
 from ..native import address, kernels
 from ..stars.glance import quaternion_of
 from ..stars.identify import Identification, matrix_of_quaternion
 from ..stars.patterns import Sky
 from ..stars.verify import middle, turn
+from .lens import Lens, LensPrior
 
 EPOCH_SPREAD_YEARS = 25.0
 """Proper motion counts as this many years of uncertainty where the time of an image is not told."""
@@ -53,56 +52,6 @@ _STEPS = 4
 _MATCHINGS = 2
 _LEAST = 3
 _ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])
-
-
-@dataclass(frozen=True)
-class LensPrior:
-    """1 sigma of what the lens may differ from the camera: focal (relative; infinite: unknown), centre_px, and k1."""
-
-    focal: float
-    centre_px: float
-    k1: float
-
-    @classmethod
-    def uncalibrated(cls, camera: Camera, focal: float) -> LensPrior:
-        """Of an unknown lens: centred within 2% of the image's width, and 1% of distortion in the corner."""
-        corner = 0.5 * math.hypot(camera.width, camera.height * camera.aspect) / camera.focal_px
-        return cls(focal, 0.02 * camera.width, 0.01 / corner**2)
-
-    @classmethod
-    def rough(cls, camera: Camera, focal: float) -> LensPrior:
-        """Of a lens that displaces stars by pixels: a decentred one, centred within 10%, and 3% of distortion in the corner."""
-        usual = cls.uncalibrated(camera, focal)
-        return cls(focal, 5.0 * usual.centre_px, 3.0 * usual.k1)
-
-    @classmethod
-    def calibrated(cls, known: Calibrated) -> LensPrior:
-        """As the calibration says; a camera written by hand is believed to 0.05% of its focal length, 0.2% of its width, and 0.1%
-        of distortion in the corner. A focal length follows the temperature: never better than 0.01%."""
-        camera = known.camera
-        corner = 0.5 * math.hypot(camera.width, camera.height * camera.aspect) / camera.focal_px
-        focal = 5e-4 if known.focal_sigma_px is None else math.hypot(known.focal_sigma_px / camera.focal_px, 1e-4)
-        centre = 0.002 * camera.width if known.centre_sigma_px is None else known.centre_sigma_px
-        return cls(focal, centre, 0.001 / corner**2 if known.k1_sigma is None else known.k1_sigma)
-
-
-def lens_sigmas(fit: Calibration) -> tuple[float, float, float]:
-    """1 sigma of focal length (relative), centre (px) and k1 that move pixels as a calibration's whole covariance does.
-
-    A calibration's parameters are correlated, and more than `LensPrior` has: what they leave open of the image, over a grid, is
-    projected on turns (which belong to the attitude), focal length, centre and k1.
-    """
-    camera, names = fit.camera, fit.names
-    grid = np.stack(np.meshgrid(np.linspace(0.05, 0.95, 8), np.linspace(0.05, 0.95, 8)), axis=-1).reshape(-1, 2)
-    d = camera.directions(grid * [camera.width, camera.height])
-    d = d[np.isfinite(d).all(axis=1)]
-    _, J = _Lens.of(camera, LensPrior.uncalibrated(camera, 1.0)).predict(np.eye(3), np.zeros(4), d)
-    J = J.reshape(-1, 7)
-    open_ = derivative(camera, names, d).reshape(-1, len(names))
-    scale = np.linalg.norm(J, axis=0)
-    A = np.linalg.lstsq(J / scale, open_, rcond=1e-6)[0] / scale[:, None]
-    sigma = np.sqrt(np.maximum(np.diagonal(A @ fit.covariance @ A.T), 0.0))
-    return float(sigma[3]), float(max(sigma[4], sigma[5] * camera.aspect)), float(sigma[6])
 
 
 @dataclass(frozen=True)
@@ -138,7 +87,7 @@ def refine(
     drift = epoch_years * found.focal_px * np.hypot(sky.catalog.pm_ra[near], sky.catalog.pm_dec[near])
     density = len(centroids) / (camera.width * camera.height)
     problem = _Problem(
-        _Lens.of(camera, prior), d_N, V, drift, centroids.xy_px, centroids.covariance_px, magnitude, zero, magnitude_gate,
+        Lens.of(camera, prior), d_N, V, drift, centroids.xy_px, centroids.covariance_px, magnitude, zero, magnitude_gate,
         density,
     )  # fmt: skip
     p, library = np.array([np.log(found.focal_px / camera.focal_px), 0.0, 0.0, 0.0]), kernels()
@@ -187,74 +136,11 @@ def _in_view(
 
 
 @dataclass(frozen=True)
-class _Lens:
-    """The camera, the information (7,) of the priors on theta (none), ln f, e_x, e_y, k1, and round (2, 2): a round
-    uncertainty of the sky in the image's pixels."""
-
-    camera: Camera
-    known: np.ndarray
-    round: np.ndarray
-
-    @classmethod
-    def of(cls, camera: Camera, prior: LensPrior) -> _Lens:
-        sigma = (prior.focal, prior.centre_px, prior.centre_px / camera.aspect, prior.k1)
-        known = np.array([0.0, 0.0, 0.0, *(1.0 / max(s, 1e-9) ** 2 for s in sigma)])
-        return cls(camera, known, np.array([[1.0, 0.0], [0.0, camera.aspect**-2]]))
-
-    def predict(self, R: np.ndarray, p: np.ndarray, d_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (n, 2) of directions, and their derivative (n, 2, 7) by theta, ln f, e_x, e_y, k1."""
-        c = self.camera
-        a, f, (ex, ey) = c.aspect, c.focal_px * np.exp(p[0]), p[1:3]
-        k1, k2, p1, p2, k3 = c.distortion
-        k1 = k1 + p[3]
-        # Where the lens itself sees the stated centre: a turn takes z of S there.
-        sx, sy = -ex / f, -a * ey / f
-        r2 = sx * sx + sy * sy
-        sx, sy = sx / (1.0 + k1 * r2), sy / (1.0 + k1 * r2)
-        T = _turn_to(sx, sy)
-        v = d_N @ (T @ R).T
-        x, y = v[:, 0] / v[:, 2], v[:, 1] / v[:, 2]
-        xy = x * y
-        xx, yy = 1.0 + x * x, 1.0 + y * y
-        turn_x, turn_y = (-xy, xx, -y), (-yy, xy, x)
-        shift_x, shift_y = -sx * xx - sy * xy, -sy * yy - sx * xy
-        r2 = x * x + y * y
-        g = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        h = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
-        xd = x * g + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-        yd = y * g + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-        cross = h * x * y + 2.0 * p1 * x + 2.0 * p2 * y
-        dxx = g + h * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-        dyy = g + h * y * y + 6.0 * p1 * y + 2.0 * p2 * x
-        J = np.empty((len(x), 2, 7))
-        for k in range(3):
-            J[:, 0, k] = f * (dxx * turn_x[k] + cross * turn_y[k])
-            J[:, 1, k] = f / a * (cross * turn_x[k] + dyy * turn_y[k])
-        J[:, 0, 3] = f * (xd + dxx * shift_x + cross * shift_y)
-        J[:, 1, 3] = f / a * (yd + cross * shift_x + dyy * shift_y)
-        J[:, :, 4] = [1.0, 0.0] - J[:, :, 1] / f
-        J[:, :, 5] = [0.0, 1.0] + a * J[:, :, 0] / f
-        J[:, :, :3] = (J[:, :, :3].reshape(-1, 3) @ T).reshape(-1, 2, 3)
-        J[:, 0, 6], J[:, 1, 6] = f * x * r2, f / a * y * r2
-        return np.stack([c.cx + ex + f * xd, c.cy + ey + f / a * yd], axis=1), J
-
-    def second_order(self, delta: np.ndarray) -> float:
-        """Bound, px, on what a step (7,) leaves: products of turns, of the focal length's and of the centre's share."""
-        f = self.camera.focal_px
-        turned, centre = float(np.abs(delta[:3]).sum()), float(np.abs(delta[4:6]).sum())
-        return f * (turned + abs(float(delta[3])) + centre / f) ** 2
-
-    def prior(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Information (7,) of what is known before, and its gradient (7,) at p."""
-        return self.known, -self.known * np.concatenate([np.zeros(3), p])
-
-
-@dataclass(frozen=True)
 class _Problem:
     """Stars: directions (n, 3), V (n,), and drift (n,), px, by which they may have moved, the brightest first. Detections: xy
     (m, 2) and covariance (m, 2, 2), px, magnitude (m,), which with `zero` is V to `magnitude_gate`, and density, 1/px^2."""
 
-    lens: _Lens
+    lens: Lens
     directions: np.ndarray
     V: np.ndarray
     drift: np.ndarray
@@ -350,14 +236,6 @@ def _compiled(library: ctypes.CDLL, q: _Problem, R: np.ndarray, p: np.ndarray, i
     )  # fmt: skip
 
 
-def _turn_to(x: float, y: float) -> np.ndarray:
-    """The least turn (3, 3) that takes z to the direction of [x, y, 1]."""
-    length = np.sqrt(x * x + y * y + 1.0)
-    a, b, c = x / length, y / length, 1.0 / length
-    k = 1.0 / (1.0 + c)
-    return np.array([[1.0 - k * a * a, -k * a * b, a], [-k * a * b, 1.0 - k * b * b, b], [-a, -b, c]])
-
-
 @dataclass(frozen=True)
 class _Settled:
     """Step (7,) of the parameters, their covariance (7, 7), and the scale of the residuals."""
@@ -445,4 +323,4 @@ def _depth(gain: np.ndarray, rank: np.ndarray, count: int) -> int:
     return int(total.argmax()) + 1
 
 
-__all__ = ["EPOCH_SPREAD_YEARS", "LensPrior", "Refined", "refine"]
+__all__ = ["EPOCH_SPREAD_YEARS", "Refined", "refine"]

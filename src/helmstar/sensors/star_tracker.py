@@ -29,7 +29,8 @@ from ..stars.identify import LIMIT, Identification, identify, matrix_of_quaterni
 from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
 from ..stars.track import WIDEST_PX, track
-from .refine import EPOCH_SPREAD_YEARS, LensPrior, Refined, refine
+from .lens import LensPrior
+from .refine import EPOCH_SPREAD_YEARS, Refined, refine
 
 FOCAL_SIGMA = 0.005
 """1 sigma, relative, of a focal length that stands for a stated field of view."""

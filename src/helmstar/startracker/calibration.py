@@ -12,7 +12,8 @@ from ..errors import DataError
 from ..imaging import Camera, Centroids
 from ..imaging.calibrate import DEFAULT, Calibration, Matches, calibrate
 from ..imaging.calibrated import Calibrated
-from ..sensors.refine import LensPrior, lens_sigmas, refine
+from ..sensors.lens import LensPrior, lens_sigmas
+from ..sensors.refine import refine
 from ..sensors.star_tracker import StarSolution, StarTracker
 from ..stars.doubt import magnitude_of_order
 from ..stars.identify import matrix_of_quaternion
