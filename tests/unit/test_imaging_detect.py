@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from helmstar.imaging import Camera, DetectionSettings, Image, dark_of, detect
+from helmstar.imaging.detect import detect_near, detect_next
 from helmstar.imaging.render import Exposure, Glow, Truth, render
 
 CAMERA = Camera.from_fov(12.0, 640, 512)
@@ -149,6 +150,38 @@ def test_stars_that_fill_the_coarsest_window(psf, smear_px):
     assert hits >= 0.9 * there
 
 
+@pytest.mark.parametrize(
+    ("psf", "smear_px", "roll"),
+    [(5.0, 0.0, 0.0), (8.0, 0.0, 0.0), (3.0, 22.0, 0.0), (3.0, 22.0, 0.7), (2.0, 26.0, 1.4)],
+)
+def test_stars_broader_than_the_third_scale(psf, smear_px, roll):
+    """One star each, at the middle of its trail, as exact as it claims; also by a frame that knows the optics, and near places."""
+    rate = smear_px / CAMERA.focal_px / 0.2
+    e = Exposure(zero_point_e_s=4e7, psf_sigma_px=psf, omega_SN_S=(rate * np.sin(roll), rate * np.cos(roll), 0.0))
+    hits, there, z = 0, 0, []
+    for seed in range(40, 43):
+        image, truth = scene(12, seed, e, faint=5.0)
+        whole, optics = detect_next(image)
+        assert optics is not None
+        at = np.stack([truth.x_px, truth.y_px], axis=1)
+        for found in (whole, detect_next(image, optics=optics)[0], detect_near(image, at, 3.0, optics)):
+            i, k = matched(found, truth, within=3.0)
+            assert len(found) - len(i) <= 1
+            assert len(set(k)) == len(k)
+            hits, there = hits + len(k), there + len(at)
+            error = found.xy_px[i] - at[k]
+            z.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance_px[i]), error) / 2)
+    assert hits >= 0.9 * there
+    # The median: stars whose trail the frame's edge cuts are off by more than they can know.
+    assert np.median(np.concatenate(z)) < 1.0
+
+
+def test_three_scales_are_the_same_where_the_fourth_is_not_needed():
+    for psf in (0.8, 1.5, 2.2):
+        image, _ = scene(30, 3, Exposure(psf_sigma_px=psf))
+        assert np.array_equal(detect(image).xy_px, detect(image, DetectionSettings(levels=3)).xy_px)
+
+
 @pytest.mark.parametrize("value", [0, 128, 255])
 def test_an_empty_sky_has_no_stars(value):
     assert len(detect(Image(np.full((300, 400), value, np.uint8), 255.0, 8))) == 0
@@ -230,7 +263,7 @@ def test_one_image_gives_the_same_stars_whatever_its_type():
     assert small.x_px == pytest.approx(large.x_px, abs=1e-3)
 
 
-@pytest.mark.parametrize("wrong", [{"threshold": 1.0}, {"levels": 4}, {"max_stars": 0}])
+@pytest.mark.parametrize("wrong", [{"threshold": 1.0}, {"levels": 5}, {"max_stars": 0}])
 def test_settings_that_mean_nothing(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         DetectionSettings(**wrong)

@@ -18,7 +18,7 @@
 #define INLINE static inline __attribute__((always_inline))
 
 #define LANES 8
-#define MOST 19 /* widest window */
+#define MOST 35 /* widest window */
 #define STILL 0.02f
 #define MIN_SIGMA 0.3f
 
@@ -144,6 +144,7 @@ FAST int helmstar_fit(
     if (m < 1 || m > MOST || m % 2 == 0) return 1;
     const int pixels = m * m;
     const float half = (float)(m / 2);
+    const float furthest = half > 9.0f ? half / 18.0f : 0.5f;
     const float wx = (float)width[0], wy = (float)width[1];
     for (int64_t first = 0; first < n; first += LANES) {
         const int some = n - first < LANES ? (int)(n - first) : LANES;
@@ -194,7 +195,7 @@ FAST int helmstar_fit(
             decompose(A, L, inverse);
             substitute(L, inverse, g);
             for (int a = 0; a < 6; a++) {
-                lanes next = p[a] + (a < 2 ? g[a] * flux : clipped(g[a], -0.5f, 0.5f));
+                lanes next = p[a] + (a < 2 ? g[a] * flux : clipped(g[a], -furthest, furthest));
                 if (a == 0) next = most(next, flux * 0.1f);
                 if (a == 2 || a == 3) next = clipped(next, -half, half);
                 if (a > 3) next = clipped(next, MIN_SIGMA, half);
@@ -202,7 +203,7 @@ FAST int helmstar_fit(
             }
             if (k) {
                 const lanes bound = noisy * 0.1f / (flux * root(least(A[2][2], A[3][3])));
-                const lanes step = least(most(magnitude(g[2]), magnitude(g[3])), all(0.5f));
+                const lanes step = least(most(magnitude(g[2]), magnitude(g[3])), all(furthest));
                 going &= step > most(bound, all(STILL));
                 int any = 0;
                 for (int l = 0; l < LANES; l++) any |= going[l];

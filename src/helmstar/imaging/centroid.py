@@ -151,6 +151,7 @@ def fit(
     spread = (np.maximum(noise, 1e-9)[:, None] / (tight * width)).astype(np.float32)
     low, high = np.array([-np.inf, -half, -half, MIN_SIGMA, MIN_SIGMA]), np.array([np.inf, half, half, half, half])
     low, high = low.astype(np.float32), high.astype(np.float32)
+    furthest = max(0.5, half / 18)
     going = None
     for k in range(iterations):
         q, d, blank = (p, data, filled) if going is None else (p[going], data[going], filled[going])
@@ -169,7 +170,7 @@ def fit(
         g += prior * away
         step = np.linalg.solve(A, g[:, :, None])[:, :, 0]
         step[:, :2] *= flux
-        np.clip(step[:, 2:], -0.5, 0.5, out=step[:, 2:])
+        np.clip(step[:, 2:], -furthest, furthest, out=step[:, 2:])
         new = q + step
         np.maximum(new[:, :1], np.float32(0.1) * flux, out=new[:, :1])
         np.clip(new[:, 1:], low, high, out=new[:, 1:])

@@ -16,13 +16,13 @@ import numpy as np
 from ..native import address, kernels
 from .background import between, mesh_of
 from .frame import Centroids, Image
-from .measure import BRIGHT, measure, nothing, width_of
+from .measure import BRIGHT, broad_width_of, measure, nothing, width_of
 from .pyramid import TILES, Peaks, find_peaks, halve
 from .settings import HALF, DetectionSettings, Optics
 from .windows import TYPES, around
 from .windows import declared as declared_windows
 
-_COARSE = 1.8  # px; optics broader than this need the coarsest level
+_COARSE = 1.8  # px; optics broader than this need the coarser levels
 _FEW = 6  # stars; fewer do not confirm what is believed of the optics
 _FULL = 9  # pixels at the limit that the fit fills in a window as wide as the optics need
 _SAME = 0.2  # of the logarithm of the width
@@ -76,7 +76,7 @@ def detect_near(
     reach, quantum = int(np.ceil(reach_px)), _quantum(image)
     side = reach + 2 + (3 << level)
     x, y, excess, noise = _lights(image.array, at, reach, side, level, quantum, dark)
-    filtered = noise * (0.375, 0.2, 0.13)[level]  # sigma of the mean under those weights
+    filtered = noise * (0.375, 0.2, 0.13, 0.14)[level]  # sigma of the mean under those weights
     good = (excess > s.threshold * filtered) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     _, first = np.unique(y[good] * width + x[good], return_index=True)
     keep = np.flatnonzero(good)[first]
@@ -172,7 +172,7 @@ def _at_scale(
         light = around(array, x[full], y[full], HALF[level]) >= 0.98 * image.saturation
         full[full] = light.sum(axis=(1, 2)) > _FULL
     parts, widths = [], []
-    for k, mine in ((level, ~full), (min(level + 1, 2), full)):
+    for k, mine in ((level, ~full), (max(level, min(level + 1, 2)), full)):
         if mine.any():
             parts.append(measure(array, image, x[mine], y[mine], snr[mine], floor[mine], k, width, s, quantum, widths))
     if not len(parts[0]) or sum(map(len, parts)) < _FEW:
@@ -201,7 +201,7 @@ def _at_all_scales(
     width: np.ndarray | None = None
     binned = array
     places: tuple[np.ndarray, ...] = ()
-    for k in range(s.levels):
+    for k in range(min(s.levels, 3)):
         if min(binned.shape) < 40:
             break
         found.append(_candidates(array, binned, k, s, quantum))
@@ -210,10 +210,17 @@ def _at_all_scales(
             continue
         places = _merged(found, s)
         width = width_of(array, image, *places[:4])
-        if width is not None and width.max() < _COARSE:  # sharp stars: the coarsest level would show only structure
+        if width is not None and width.max() < _COARSE:  # sharp stars: a coarser level would show only structure
             break
-        if k + 1 < s.levels:
+        if k + 1 < min(s.levels, 3):
             binned = halve(binned)
+    # What is broader than the finer windows is searched for only where they do not tell sharp optics.
+    if s.levels > 3 and len(found) == 3 and min(binned.shape) >= 80 and (width is None or width.max() >= _COARSE):
+        wider = _merged([*found, _candidates(array, halve(binned), 3, s, quantum)], s)
+        broad = broad_width_of(array, image, wider[0], wider[1], wider[3])
+        if broad is not None and broad.max() > HALF[1] / 2:  # else what is large here is structure
+            width = broad
+            places = wider if Optics((float(broad[0]), float(broad[1]))).level == 3 else places
     if not found:
         return nothing(), None
     x, y, level, snr, floor = places or _merged(found, s)

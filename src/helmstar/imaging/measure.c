@@ -2,8 +2,8 @@
 #include <math.h>
 #include <stdint.h>
 
-#define MOST 19 /* widest window */
-#define COARSEST 9 /* half the side of the widest that measure.py has, and two bounds of its _is_star */
+#define MOST 35 /* widest window */
+#define COARSE 9 /* half the side from which measure.py takes wider stars, and two bounds of its _is_star */
 #define FILLS 0.85
 #define WELL 0.8f
 
@@ -19,6 +19,7 @@ int helmstar_judge(
     if (m < 1 || m > MOST || m % 2 == 0) return 1;
     const int pixels = m * m, half = m / 2;
     const float g = (float)gain;
+    const float share = pixels > 361 ? (float)(361.0 / pixels) : 1.0f; /* of the noise, as in a window of level 2 */
     for (int64_t s = 0; s < n; s++) {
         const float *w = model + s * pixels, *r = residual + s * pixels, *a = above + s * pixels;
         const float *B = bread + s * 36, *L = light + s * 36;
@@ -72,8 +73,8 @@ int helmstar_judge(
         if (!(shorter > 0.02 * middle + 1e-12)) shorter = 0.02 * middle + 1e-12;
         elongation[s] = (float)sqrt((middle + swing) / shorter);
         const double narrow = p[6 * s + 4] > p[6 * s + 5] ? p[6 * s + 5] : p[6 * s + 4];
-        const float explained = sums[4 * s + 1] / (sums[4 * s + 1] + sums[4 * s + 2]);
-        const int wider = half == COARSEST && wide < FILLS * half && explained > WELL;
+        const float explained = sums[4 * s + 1] / (sums[4 * s + 1] + sums[4 * s + 2] * share);
+        const int wider = half >= COARSE && wide < FILLS * half && explained > WELL;
         star[s] = flux > 0.6 * threshold * (double)noisy[s] * sqrt(12.566370614359172 * wide * narrow) && fabs(x) < 0.6 * half &&
                   fabs(y) < 0.6 * half && (wide < 0.6 * half || wider) && explained > 0.4f;
     }

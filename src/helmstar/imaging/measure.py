@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..native import address, kernels
-from .centroid import Fit, fit, gain_of
+from .centroid import ITERATIONS, Fit, fit, gain_of
 from .frame import Centroids, Image
 from .settings import HALF, WIDTH, DetectionSettings
 from .windows import Windows, windows
@@ -21,6 +21,8 @@ BRIGHT = 15.0
 """Signal over noise from which a star tells of the optics."""
 _MISFIT = 1.5  # chi-square per pixel above which the model, not noise, is what is wrong
 _FILLS, _WELL = 0.85, 0.8  # widest sigma, over half the window, of a star that explains so much of it
+_ALIKE = 0.3  # of the logarithm of the widths of one frame's stars
+_MOSTLY = 0.6  # of their light, explained; a Gaussian along rows and columns explains less of a diagonal trail than of another
 _FOR_WIDTH = 24  # stars whose widths tell the optics
 
 
@@ -45,12 +47,31 @@ def width_of(
     return np.median(f.sigma, axis=0)
 
 
+def broad_width_of(array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, snr: np.ndarray) -> np.ndarray | None:
+    """Sigma (2,) of stars that the finer windows cannot hold, px; None where most bright places are nothing of the kind."""
+    some = np.flatnonzero(snr > BRIGHT)[:_FOR_WIDTH]
+    if some.size < 3:
+        return None
+    w = windows(array, image, x[some], y[some], HALF[3], 1e-9)
+    clear = ~w.filled.any(axis=(1, 2)) & ~w.structure
+    if clear.sum() < 3:
+        return None
+    expected = np.full(2, WIDTH[3])
+    w = Windows(**{k: v[clear] for k, v in vars(w).items()})
+    f = fit(w.inner, w.x0, w.y0, w.sky, w.noise, expected, w.filled, 0.5, 2 * ITERATIONS)
+    width, light = np.median(f.sigma, axis=0), f.sums[:, 1]
+    alike = (np.abs(np.log(f.sigma / width)) < _ALIKE).all(axis=1) & (light > _MOSTLY * (light + f.sums[:, 2]))
+    return width if alike.sum() >= max(3, clear.sum() / 2) else None
+
+
 def measure(
     array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, snr: np.ndarray, floor: np.ndarray, level: int,
     width: np.ndarray | None, s: DetectionSettings, quantum: float, widths: list[np.ndarray] | None = None,
 ) -> Centroids:  # fmt: skip
     """Fit the places of one level and keep those that are stars. widths: gets the fitted sigmas (n, 2) of these."""
     half = HALF[level]
+    if level == 3:
+        x, y = _middles(array, image, x, y, half, width)
     rounding = quantum / np.sqrt(12.0)
     w = windows(array, image, x, y, half, np.minimum(floor, rounding))
     calm = np.flatnonzero(~w.structure)
@@ -60,7 +81,8 @@ def measure(
         x, y, snr, floor = x[calm], y[calm], snr[calm], floor[calm]
         w = Windows(**{k: v[calm] for k, v in vars(w).items()})
     expected = np.full(2, WIDTH[level]) if width is None else width
-    f = fit(w.inner, w.x0, w.y0, w.sky, w.noise, expected, w.filled, 0.25 if width is not None else 0.35)
+    tight, iterations = 0.25 if width is not None else 0.35, 2 * ITERATIONS if level == 3 else ITERATIONS
+    f = fit(w.inner, w.x0, w.y0, w.sky, w.noise, expected, w.filled, tight, iterations)
     clear = (snr > BRIGHT) & ~w.filled.any(axis=(1, 2))
     gain = s.gain if s.gain is not None else gain_of(f, w.noise, clear)
     # Noise with a pattern (mosaics, JPEG) is larger in sums of pixels than its pixels say; the filtered image shows it.
@@ -75,6 +97,21 @@ def measure(
         elongation=elongation, snr=snr,
     )  # fmt: skip
     return everything.take(star)
+
+
+def _middles(
+    array: np.ndarray, image: Image, x: np.ndarray, y: np.ndarray, half: int, width: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places x, y (n,) of level 3, which are known to 8 px, moved into the middle of their light: a window that cuts one end of a
+    trail off more than the other would pull its centre.
+    """
+    for _ in range(2):
+        w = windows(array, image, x, y, half, 1e-9)
+        expected = np.full(2, WIDTH[3]) if width is None else width
+        f = fit(w.inner, w.x0, w.y0, w.sky, w.noise, expected, w.filled, 0.25, 2 * ITERATIONS)
+        x = np.clip(x + np.rint(f.x).astype(int), 0, array.shape[1] - 1)
+        y = np.clip(y + np.rint(f.y).astype(int), 0, array.shape[0] - 1)
+    return x, y
 
 
 def _judged(
@@ -127,9 +164,10 @@ def _is_star(f: Fit, noise: np.ndarray, half: int, s: DetectionSettings) -> np.n
     """Which fits look like a star: centred, neither a pixel nor a plane, and more light than the roughness around them."""
     wide, narrow = f.sigma.max(axis=1), f.sigma.min(axis=1)
     light = f.sums[:, 1]
-    explained = light / (light + f.sums[:, 2])
-    # At the coarsest level nothing wider is tried: a smeared or badly focused star may fill the window if little else does.
-    wider = (wide < _FILLS * half) & (explained > _WELL) if half == HALF[-1] else False
+    # Of the light and of as much noise as a window of level 2 holds: a larger one would have none but the brightest stars.
+    explained = light / (light + f.sums[:, 2] * np.float32(min(1.0, ((2 * HALF[2] + 1) / (2 * half + 1)) ** 2)))
+    # Nothing much wider is tried than the coarse levels: a smeared or badly focused star may fill the window if little else does.
+    wider = (wide < _FILLS * half) & (explained > _WELL) if half >= HALF[2] else False
     return (
         (f.flux > 0.6 * s.threshold * noise * np.sqrt(4 * np.pi * wide * narrow))
         & (np.maximum(np.abs(f.x), np.abs(f.y)) < 0.6 * half)
@@ -154,4 +192,4 @@ def _elongation(above: np.ndarray, f: Fit, half: int) -> np.ndarray:
     return np.sqrt((middle + swing) / np.maximum(middle - swing, 0.02 * middle + 1e-12))
 
 
-__all__ = ["BRIGHT", "measure", "nothing", "width_of"]
+__all__ = ["BRIGHT", "broad_width_of", "measure", "nothing", "width_of"]

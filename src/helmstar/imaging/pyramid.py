@@ -1,8 +1,8 @@
 """Places that may be stars: local maxima above the noise in an image filtered at several scales.
 
 Each level is the one before, summed over 2 x 2 pixels, and is filtered by [1 2 1] both ways: a Gaussian of sigma 0.8, 1.5 and 3
-pixels for levels 0, 1 and 2. That is sharp optics, soft optics, and smeared or badly focused stars. The work is done in bands
-of rows that stay in the processor's cache, in whole numbers where these are 8 bit.
+pixels for levels 0, 1 and 2, and 6 for level 3. That is sharp optics, soft optics, and smeared or badly focused stars twice. The
+work is done in bands of rows that stay in the processor's cache, in whole numbers where these are 8 bit.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ..native import address, kernels
 from .background import PER_TILE, grid, mesh_from, mesh_of
 from .windows import TYPES
 
-TILES = (64, 48, 32)
+TILES = (64, 48, 32, 24)
 """Side of a tile of the sky's mesh at each level, in its own pixels."""
 _BAND = 128
 _ROOM = 1024  # places that are made room for at first

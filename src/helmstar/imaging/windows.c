@@ -16,7 +16,7 @@
 
 #define LANES 8
 #define BORDER 2
-#define MOST_HALF 9
+#define MOST_HALF 17
 #define MOST (2 * (MOST_HALF + BORDER) + 1)
 #define MOST_RING (MOST * MOST - (MOST - 2 * BORDER) * (MOST - 2 * BORDER))
 #define SECTORS 8
@@ -91,7 +91,7 @@ INLINE int in_structure(
     return large >= 3;
 }
 
-/* Windows of half a side `half` (2 to 9) around places x, y (n,) that are in the image (h, w); floor (n,) least noise; full: value
+/* Windows of half a side `half` (2 to 17) around places x, y (n,) that are in the image (h, w); floor (n,) least noise; full: value
    from which a pixel holds no more; sector: direction 0 to 7 of each of `ring` pixels of the ring; at: places among the ring's
    sorted pixels where the sky's mean begins and ends and of the noise's low and high, and among the sorted steps that of the grain.
    Out: inner, above (n, m, m), full and filled (n, m, m) bytes, sky, noise, grain, x0, y0 (n,), structure (n,) bytes.
@@ -114,7 +114,7 @@ FAST int helmstar_windows(
             if (l < some)
                 around(data, type, h, w, x[first + l], y[first + l], reach, a);
             else
-                memcpy(a, window[0], sizeof window[0]);
+                memcpy(a, window[0], (size_t)(side * side) * sizeof *a);
             for (int i = 0; i < r.n; i++) v[i][l] = a[r.ring[i]];
             for (int i = 0; i < r.steps; i++) steps[i][l] = fabsf(a[r.to[i]] - a[r.from[i]]);
         }
