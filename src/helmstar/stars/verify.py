@@ -19,12 +19,14 @@ expected in the image matched, residuals r_j (px), detections of density lam (1/
 
 from __future__ import annotations
 
+import ctypes
 import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from ..native import address, kernels
 from .patterns import Sky
 
 BROAD_SHARE, BROAD_SIGMA, BROAD_FACTOR = 0.15, 1.5, 6.0
@@ -42,6 +44,8 @@ SCALES = (1.8, 3.2)
 """Factors on the detections' sigmas that are tried where the residuals ask for it."""
 GATE = 3.6
 """Residuals of matches, over sigma."""
+MOST_IN_C, DEEPEST_IN_C = 512, 398
+"""Detections and stars that verify.c has room for."""
 
 
 def middle(x: np.ndarray) -> float:
@@ -89,6 +93,16 @@ class Detections:
         if self.zero_point is None or self.magnitude is None or len(self.xy) == 0:
             return math.inf
         return float(self.magnitude[-1]) + self.zero_point + 3.0 * self.magnitude_sigma
+
+    @cached_property
+    def in_c(self) -> np.ndarray:
+        """The arrays as verify.c reads them, one after the other. Raises ValueError for shapes that do not belong together."""
+        n, given = len(self.xy), [self.xy, self.sigma, self.log_density, self.log_magnitude_density, self.vacancy]
+        shapes = [(n, 2), (n,), (n,), (n,), (n + 1,), (n,)]
+        given += [self.magnitude if self.magnitude is not None else np.zeros(n)]
+        if [x.shape for x in given] != shapes:
+            raise ValueError(f"detections have the shapes {[x.shape for x in given]}, not {shapes}")
+        return np.concatenate([x.ravel() for x in given], dtype=float)
 
     @cached_property
     def typical_sigma(self) -> float:
@@ -312,6 +326,28 @@ def _typical(fit: Fit, d: Detections) -> float:
     return middle(np.sqrt((fit.residuals**2).sum(axis=1)) / d.sigma[fit.detections]) / 1.18
 
 
+class _InC(ctypes.Structure):
+    """As Field in verify.c."""
+
+    _fields_ = (
+        [(k, ctypes.c_int64) for k in ("n", "stars", "limit", "has_magnitude", "knows_zero", "is_free")]
+        + [
+            (k, ctypes.c_double)
+            for k in ("low_x", "low_y", "high_x", "high_y", "faintest", "magnitude_sigma", "zero_point")
+        ]
+        + [
+            (k, ctypes.c_double)
+            for k in ("zero_point_range", "broad_share", "broad_sigma", "f_low", "f_high", "f_known")
+        ]
+        + [(k, ctypes.c_double) for k in ("f_weight", "log_volume", "gate", "hopeless")]
+        + [
+            (k, ctypes.c_void_p)
+            for k in ("xy", "sigma", "log_density", "log_magnitude_density", "vacancy", "magnitude")
+        ]
+        + [(k, ctypes.c_void_p) for k in ("r", "V", "log_factorial", "harmonic")]
+    )
+
+
 @dataclass(frozen=True)
 class _Field:
     """What a hypothesis is weighed against: detections, and the stars that may be seen (r (S, 3) in N, V (S,))."""
@@ -326,6 +362,9 @@ class _Field:
 
     def settle(self, R: np.ndarray, f: float, scale: float, first_gate: float, rounds: int) -> Fit | None:
         """Match and step `rounds` times, then match and weigh."""
+        library = kernels()
+        if library is not None and len(self.d) <= MOST_IN_C and self.limit <= DEEPEST_IN_C:
+            return self._compiled(library, R, f, scale, first_gate, rounds)
         d, freedom, zero = self.d, self.freedom, self.d.zero_point
         for turn_number in range(rounds + 1):
             p, _ = project(self.r, R, f)
@@ -369,6 +408,48 @@ class _Field:
             f = f * math.exp(min(max(float(delta[3]), -0.1), 0.1))
             f = min(max(f, 0.97 * freedom.f_low), 1.03 * freedom.f_high)
         return None
+
+    @cached_property
+    def _in_c(self) -> tuple[_InC, list[np.ndarray]]:
+        """For verify.c, and the arrays that it points to."""
+        d, freedom, n, stars = self.d, self.freedom, len(self.d), len(self.candidates)
+        if self.r.shape != (stars, 3) or self.V.shape != (stars,):
+            raise ValueError(
+                f"stars have the shapes {self.r.shape} and {self.V.shape}, not {(stars, 3)} and {(stars,)}"
+            )
+        arrays = [np.ascontiguousarray(x, dtype=float) for x in (d.in_c, self.r, self.V, LOG_FACTORIAL, HARMONIC)]
+        listed, *rest = (address(x) for x in arrays)
+        return _InC(
+            n, stars, self.limit, d.magnitude is not None, d.zero_point is not None, freedom.free, *d.low, *d.high, d.faintest,
+            d.magnitude_sigma, d.zero_point or 0.0, ZERO_POINT_RANGE, BROAD_SHARE, broad_sigma(d), freedom.f_low, freedom.f_high,
+            freedom.f_known, 1.0 / max(freedom.sigma, 1e-6) ** 2, math.log(self.volume * focal_volume(freedom)), GATE, HOPELESS,
+            *(listed + 8 * k for k in (0, 2 * n, 3 * n, 4 * n, 5 * n, 6 * n + 1)), *rest,
+        ), arrays  # fmt: skip
+
+    def _compiled(
+        self, library: ctypes.CDLL, R: np.ndarray, f: float, scale: float, first_gate: float, rounds: int
+    ) -> Fit | None:
+        """As `settle`, by verify.c."""
+        s, _ = self._in_c
+        fit, matches = np.empty(28 + 2 * self.limit), np.empty((2, self.limit), dtype=np.int64)
+        fit[:9], fit[9], at = R.ravel(), f, address(matches)
+        call = library.helmstar_settle
+        call.restype = ctypes.c_int64
+        count = call(
+            ctypes.byref(s), ctypes.c_double(scale), ctypes.c_double(first_gate), ctypes.c_int64(rounds),
+            ctypes.c_void_p(address(fit)), ctypes.c_void_p(at), ctypes.c_void_p(at + 8 * self.limit),
+        )  # fmt: skip
+        if count == -2:
+            raise np.linalg.LinAlgError("a step of the fit has no solution")
+        if count < 0:
+            raise ValueError(f"{len(self.d)} detections and {self.limit} stars: more than verify.c has room for")
+        if count == 0:
+            return None
+        stars, detections = matches[:, :count]
+        return Fit(
+            fit[:9].reshape(3, 3), float(fit[9]), self.candidates[stars], detections, fit[28 : 28 + 2 * count].reshape(-1, 2),
+            float(fit[10]), scale, float(fit[11]), fit[12:28].reshape(4, 4),
+        )  # fmt: skip
 
 
 def focal_volume(freedom: Freedom) -> float:
