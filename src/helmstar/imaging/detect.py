@@ -76,7 +76,7 @@ def detect_near(
     reach, quantum = int(np.ceil(reach_px)), _quantum(image)
     side = reach + 2 + (3 << level)
     x, y, excess, noise = _lights(image.array, at, reach, side, level, quantum, dark)
-    filtered = noise * (0.375, 0.2, 0.13, 0.14)[level]  # sigma of the mean under those weights
+    filtered = noise * (0.375, 0.273, 0.196, 0.14)[level]  # sigma of the mean under those weights
     good = (excess > s.threshold * filtered) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     _, first = np.unique(y[good] * width + x[good], return_index=True)
     keep = np.flatnonzero(good)[first]
