@@ -98,10 +98,11 @@ class Detections:
     def in_c(self) -> np.ndarray:
         """The arrays as verify.c reads them, one after the other. Raises ValueError for shapes that do not belong together."""
         n, given = len(self.xy), [self.xy, self.sigma, self.log_density, self.log_magnitude_density, self.vacancy]
-        shapes = [(n, 2), (n,), (n,), (n,), (n + 1,), (n,)]
         given += [self.magnitude if self.magnitude is not None else np.zeros(n)]
-        if [x.shape for x in given] != shapes:
-            raise ValueError(f"detections have the shapes {[x.shape for x in given]}, not {shapes}")
+        shapes = [(n, 2), (n,), (n,), (n,), (n + 1,), (n,), (2,), (2,)]
+        got = [x.shape for x in (*given, self.low, self.high)]
+        if got != shapes:
+            raise ValueError(f"detections have the shapes {got}, not {shapes}")
         return np.concatenate([x.ravel() for x in given], dtype=float)
 
     @cached_property
