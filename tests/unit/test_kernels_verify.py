@@ -149,6 +149,18 @@ def test_of_equally_near_stars_and_detections_the_first_matches():
     assert not (a.detections % 2).any()
 
 
+def test_stars_behind_the_camera_match_nothing():
+    field, start = case(0)
+    # The antipodes first: through the pinhole they would fall on the same pixels.
+    both = replace(
+        field, candidates=np.tile(field.candidates, 2), r=np.concatenate([-field.r, field.r]), V=np.tile(field.V, 2)
+    )
+    a, b, plain = both.settle(*start, 2), in_numpy(both.settle, *start, 2), field.settle(*start, 2)
+    assert_alike(a, b, 0)
+    assert_alike(a, plain, 0)
+    assert a is not None
+
+
 def test_an_empty_list_or_sky_is_nothing():
     field, start = case(0)
     args = (*start, 2)

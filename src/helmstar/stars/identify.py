@@ -170,10 +170,13 @@ def prepare(
     p = ideal_pixels(camera, xy[order])
     # One star counts once: of detections closer than a pixel the brightest stays.
     keep = np.ones(len(order), dtype=bool)
-    for k in np.flatnonzero(_crowded(p)):
+    crowded = np.flatnonzero(_crowded(p))
+    for k in crowded:
         before = keep[:k] & (np.abs(p[:k] - p[k]).max(axis=1) < 1.0)
         keep[k] = not before.any()
-    order, p = order[keep][:MOST_DETECTIONS], p[keep][:MOST_DETECTIONS]
+    if len(crowded):
+        order, p = order[keep], p[keep]
+    order, p = order[:MOST_DETECTIONS], p[:MOST_DETECTIONS]
     C = C[order]
     brightness = None if m is None else m[order]
     per_axis = np.sqrt(0.5 * (C[:, 0, 0] + C[:, 1, 1]))
@@ -188,7 +191,8 @@ def _crowded(p: np.ndarray) -> np.ndarray:
     if len(p) < 2:
         return np.zeros(len(p), dtype=bool)
     order = np.argsort(p[:, 0], kind="stable")
-    close = np.flatnonzero(np.diff(p[order, 0]) < 1.0)
+    x = p[order, 0]
+    close = np.flatnonzero(x[1:] - x[:-1] < 1.0)
     out = np.zeros(len(p), dtype=bool)
     out[order[close]] = out[order[close + 1]] = True
     return out
@@ -198,8 +202,8 @@ def _log_density(m: np.ndarray) -> np.ndarray:
     """Log density (n,) 1/mag of the detections' own magnitudes: half a smoothed count, half even over their range."""
     width = 0.5
     z = (m[:, None] - m[None, :]) / width
-    smooth = np.exp(-0.5 * z * z).mean(axis=1) / (width * np.sqrt(2.0 * np.pi))
-    even = 1.0 / (np.ptp(m) + 2.0 * width)
+    smooth = np.exp(-0.5 * z * z).sum(axis=1) / len(m) / (width * np.sqrt(2.0 * np.pi))
+    even = 1.0 / (m.max() - m.min() + 2.0 * width)
     return np.log(0.5 * smooth + 0.5 * even)
 
 
@@ -209,7 +213,8 @@ def _log_place_density(p: np.ndarray, area: float) -> np.ndarray:
     if n < 2:
         return np.full(n, np.log((n + 1.0) / area))
     width = 0.5 * np.sqrt(area / n)
-    square = ((p[:, None] - p[None]) ** 2).sum(axis=2)
+    dx, dy = p[:, :1] - p[:, 0], p[:, 1:] - p[:, 1]
+    square = dx * dx + dy * dy
     others = np.exp(-0.5 / width**2 * square).sum(axis=1) - 1.0
     return np.log(0.5 / area + 0.5 * others / (n - 1.0) / (2.0 * np.pi * width**2)) + np.log(n + 1.0)
 

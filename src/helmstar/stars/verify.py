@@ -308,7 +308,8 @@ def verify(
     """
     limit = deepest(d)
     candidates = expected_stars(sky, level, R, f, d, limit)
-    field = _Field(d, freedom, candidates, sky.directions[candidates], sky.magnitude[candidates], limit, volume)
+    r, V = sky.directions.take(candidates, axis=0), sky.magnitude.take(candidates)
+    field = _Field(d, freedom, candidates, r, V, limit, volume)
     best = field.settle(R, f, 1.0, first_gate, rounds)
     # Sigmas that were told too small show in the residuals. Wider ones are tried, and kept only if they explain more: estimated
     # from the residuals they would grow with every false match that the wider gate lets in.
@@ -421,9 +422,10 @@ class _Field:
         arrays = [np.ascontiguousarray(x, dtype=float) for x in (d.in_c, self.r, self.V, LOG_FACTORIAL, HARMONIC)]
         listed, *rest = (address(x) for x in arrays)
         return _InC(
-            n, stars, self.limit, d.magnitude is not None, d.zero_point is not None, freedom.free, *d.low, *d.high, d.faintest,
-            d.magnitude_sigma, d.zero_point or 0.0, ZERO_POINT_RANGE, BROAD_SHARE, broad_sigma(d), freedom.f_low, freedom.f_high,
-            freedom.f_known, 1.0 / max(freedom.sigma, 1e-6) ** 2, math.log(self.volume * focal_volume(freedom)), GATE, HOPELESS,
+            n, stars, self.limit, d.magnitude is not None, d.zero_point is not None, freedom.free,
+            *d.low.tolist(), *d.high.tolist(), d.faintest, d.magnitude_sigma, d.zero_point or 0.0, ZERO_POINT_RANGE,
+            BROAD_SHARE, broad_sigma(d), freedom.f_low, freedom.f_high, freedom.f_known, 1.0 / max(freedom.sigma, 1e-6) ** 2,
+            math.log(self.volume * focal_volume(freedom)), GATE, HOPELESS,
             *(listed + 8 * k for k in (0, 2 * n, 3 * n, 4 * n, 5 * n, 6 * n + 1)), *rest,
         ), arrays  # fmt: skip
 
