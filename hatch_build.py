@@ -30,7 +30,6 @@ def checksum(sources: list[Path]) -> int:
 def compile_kernels(package: Path) -> Path | None:
     """The shared library, or None with a line of why."""
     out = package / "_kernels.so"
-    out.unlink(missing_ok=True)
     sources = sorted(package.rglob("*.c"))
     compiler = os.environ.get("CC") or next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
     if os.environ.get("HELMSTAR_NATIVE") == "0" or not sources or sys.platform == "win32":
@@ -44,6 +43,7 @@ def compile_kernels(package: Path) -> Path | None:
     part = out.with_suffix(f".{os.getpid()}.part")
     command = [*compiler.split(), *FLAGS, f"-DHELMSTAR_SOURCES={checksum(sources)}u"]
     try:
+        out.unlink(missing_ok=True)
         done = subprocess.run(
             [*command, "-o", str(part), *map(str, sources), "-lm"], capture_output=True, text=True, timeout=300
         )
@@ -64,6 +64,8 @@ class KernelsHook(BuildHookInterface):
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         if compile_kernels(Path(self.root) / "src" / "helmstar") is not None:
             build_data["pure_python"] = False
-            # Plain C through ctypes: tied to the machine, not to one Python.
-            build_data["tag"] = "py3-none-" + sysconfig.get_platform().replace("-", "_").replace(".", "_")
             build_data["artifacts"].append("src/helmstar/_kernels.so")
+            if sys.platform == "darwin":  # which of its names pip takes is the builder's business
+                build_data["infer_tag"] = True
+            else:  # plain C through ctypes: tied to the machine, not to one Python
+                build_data["tag"] = "py3-none-" + sysconfig.get_platform().replace("-", "_").replace(".", "_")

@@ -6,6 +6,7 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 
 from . import __version__
+from .native import kernels
 
 PACKAGES = ("helmstar", "jax", "jaxlib", "numpy", "scipy", "xarray", "pandas", "plotly", "pydantic")
 
@@ -18,4 +19,4 @@ def versions() -> dict[str, str]:
             out[package] = version(package)
         except PackageNotFoundError:
             out[package] = "not installed"
-    return out | {"helmstar": __version__}
+    return out | {"helmstar": __version__, "kernels": "NumPy" if kernels() is None else "compiled"}

@@ -70,7 +70,9 @@ def test_the_covariance_holds_for_unknown_lenses_and_for_sigmas_that_were_told_t
     squares, scales = np.array([normalised(seed, sigma) for seed in range(50)]).T
     # 50 times chi-square of 3: mean 3, one sigma sqrt(6/50) = 0.35. The scale's own error adds a twentieth; the belief in sigmas
     # that were told wrongly and Huber's cut a tenth each where they are 2.5 times too small.
-    assert 2.0 < squares.mean() < (4.6 if sigma == 0.1 else 5.5)
+    # Of a rough camera's displacement a quarter counts as common to all stars, which it is not here: sigma is wider by a half.
+    low, high = (2.0, 4.6) if sigma == 0.1 else (1.2, 5.5)
+    assert low < squares.mean() < high
     # Sigmas that were told 2.5 times too small make the camera a rough one, whose displacement of stars then explains the
     # residuals: 40 stars (some 75 degrees of freedom) against the belief in the sigmas (8), and Huber's cut.
     assert np.median(scales) == pytest.approx(1.0, rel=0.2)

@@ -57,11 +57,13 @@ _ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])
 @dataclass(frozen=True)
 class Refined:
     """identification: with the attitude, covariance, matches and residuals of the fit. camera: with the fit's focal length and
-    k1. scale: factor on the sigmas of the matched stars that their residuals show; the covariance holds it."""
+    k1. scale: factor on the sigmas of the matched stars that their residuals show; the covariance holds it. strain:
+    the largest of what the fit found of centre and k1, over the prior's sigma."""
 
     identification: Identification
     camera: Camera
     scale: float
+    strain: float = 0.0
 
 
 def refine(
@@ -107,7 +109,8 @@ def refine(
         ra=math.atan2(z[1], z[0]) % (2.0 * math.pi), dec=math.asin(max(-1.0, min(1.0, z[2]))),
         roll=math.atan2(-fit.R[0, 2], -fit.R[1, 2]) % (2.0 * math.pi),
     )  # fmt: skip
-    return Refined(better, _with(camera, focal, float(fit.p[3])), fit.scale)
+    strain = float(np.sqrt(np.max(fit.p[1:] ** 2 * problem.lens.known[4:])))
+    return Refined(better, _with(camera, focal, float(fit.p[3])), fit.scale, strain)
 
 
 def _with(camera: Camera, focal_px: float, k1: float) -> Camera:

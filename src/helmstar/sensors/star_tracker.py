@@ -38,6 +38,14 @@ CALIBRATED_SIGMA = 0.0005
 """The same of a calibrated camera."""
 ROUGH_SCALE = 1.5
 """Factor on the centroids' sigmas from which a fit says that the lens displaces stars, not noise."""
+ROUGH_STRAIN = 2.5
+"""Sigmas of the usual lens's prior from which its centre or k1 is not that of a usual lens."""
+BRIGHTEST, BRIGHT_SHARE = 12, 0.75
+"""Of so many detections, the brightest, a fit that is beyond doubt explains this share."""
+BELIEF = 2.0
+"""Coordinates that what is believed of a rough lens is worth."""
+SMOOTH_SHARE = 0.25
+"""Of a rough lens's displacement, what is common to all stars and is taken for attitude."""
 TRACKED = 50
 """Stars whose windows are looked at in tracking."""
 AU_DAY = 149597870700.0 / 86400.0
@@ -224,6 +232,10 @@ class StarTracker:
                 found, centroids, camera, focal_sigma if fov_range is None else math.inf, doubt
             )
             found, camera, scale = refined.identification, refined.camera, refined.scale
+            if isinstance(self.fov_deg, float | int) and self.camera is None:
+                off = math.log(camera.focal_px / eye.focal_px)
+                if abs(off) > 5.0 * focal_sigma and "field" not in doubt:
+                    doubt = "rough, field" if doubt == "rough" else "field"
         end = time.perf_counter()
         ms = {**(ms or {}), "identify": 1e3 * (done - begin), "refine": 1e3 * (end - done)}
         ms["total"] = sum(ms.values())
@@ -235,24 +247,32 @@ class StarTracker:
         """The last fit, within what is known of the lens, and what had to be doubted for it."""
         if self.known is not None:
             return refine(found, centroids, camera, self.sky, LensPrior.calibrated(self.known), self.epoch_years), doubt
-        if doubt == "field":  # the fit must not lean on a statement that was wrong
+        if "field" in doubt:  # the fit must not lean on a statement that was wrong
             focal_sigma = math.inf
-        floor = ROUGH_WIDTHS * camera.width
+        first, floor = None, ROUGH_WIDTHS * camera.width
         if doubt != "rough":
             lens = LensPrior.uncalibrated(camera, focal_sigma)
-            refined = refine(found, centroids, camera, self.sky, lens, self.epoch_years)
-            if refined.scale < ROUGH_SCALE:
-                return refined, doubt
-            floor = min(floor, _residual_px(refined))
+            first = refine(found, centroids, camera, self.sky, lens, self.epoch_years)
+            plain = _bright_share(first, centroids) >= BRIGHT_SHARE
+            if first.scale < ROUGH_SCALE and first.strain < ROUGH_STRAIN and plain:
+                return first, doubt
+            if plain:
+                floor = _displaced_px(first, floor)
         lens, magnitude = LensPrior.rough(camera, focal_sigma), magnitude_of_order(centroids.flux)
-        refined = None
+        rough = None
         for _ in range(2):  # the second time with what the stars are displaced by indeed
             C = roughened(centroids.covariance_px, len(centroids), floor)
             places = replace(centroids, covariance_px=C)
-            refined = refine(found, places, camera, self.sky, lens, self.epoch_years, magnitude)
-            floor = min(floor, _residual_px(refined))
-        assert refined is not None
-        return refined, "rough"
+            rough = refine(found, places, camera, self.sky, lens, self.epoch_years, magnitude)
+            floor = _displaced_px(rough, floor)
+        assert rough is not None
+        if first is not None:
+            told, more = len(first.identification.stars), len(rough.identification.stars)
+            # False stars are no reason to doubt a camera, nor is a fit that came to nothing.
+            few = first.scale < ROUGH_SCALE and first.strain < ROUGH_STRAIN and more < 1.4 * told + 1
+            if few or rough.identification is found:
+                return first, doubt
+        return _smooth(rough, floor, camera), "rough" if doubt != "field" else "rough, field"
 
     def _honest(self, centroids: Centroids) -> Centroids:
         """With the covariances that the calibration found."""
@@ -278,9 +298,27 @@ class StarTracker:
         return Camera.from_fov(self.fov_deg, width, height, self.aspect), None, FOCAL_SIGMA
 
 
-def _residual_px(refined: Refined) -> float:
-    """Root mean square of a fit's residuals, px per axis."""
-    return refined.identification.residual_rms * refined.camera.focal_px
+def _displaced_px(fit: Refined, believed_px: float) -> float:
+    """By how much, 1 sigma per axis, a fit's stars are displaced: its residuals, of the freedom that seven parameters left, and
+    what was believed before, as worth as `BELIEF` coordinates; no more than that."""
+    i = fit.identification
+    chi2 = 2.0 * len(i.stars) * (i.residual_rms * fit.camera.focal_px) ** 2
+    free = max(2.0 * len(i.stars) - 7.0, 0.0)
+    return min(believed_px, math.sqrt((BELIEF * believed_px**2 + chi2) / (BELIEF + free)))
+
+
+def _bright_share(fit: Refined, centroids: Centroids) -> float:
+    """Share of the brightest detections that a fit explains: the flux comes sorted."""
+    count = min(len(centroids), BRIGHTEST)
+    return float((fit.identification.detections < count).sum() / max(count, 1))
+
+
+def _smooth(fit: Refined, displaced_px: float, camera: Camera) -> Refined:
+    """With what a lens's displacement does to all stars together, which more stars do not average: a share of it."""
+    i = fit.identification
+    sigma = SMOOTH_SHARE * displaced_px / fit.camera.focal_px
+    spread = math.hypot(camera.width, camera.height * camera.aspect) / math.sqrt(12.0) / fit.camera.focal_px
+    return replace(fit, identification=replace(i, covariance=i.covariance + sigma**2 * np.diag([1.0, 1.0, spread**-2])))
 
 
 def observer(julian_date_tt: float) -> tuple[float, np.ndarray]:

@@ -16,7 +16,7 @@ import numpy as np
 from .identify import LIMIT, WORK, Identification, identify
 from .pinhole import Camera
 
-Doubt = Literal["", "rough", "field"]
+Doubt = Literal["", "rough", "field", "rough, field"]
 
 ODDS = 10.0
 """Against each doubt."""
@@ -71,15 +71,16 @@ def identify_uncalibrated(
     sigma_px: float | np.ndarray = 0.5,
     fov_range: tuple[float, float] | None = None,
     focal_sigma: float = 0.005,
-    limit: float = LIMIT,
+    limit: float | None = None,
     work: int = WORK,
     **others,
 ) -> Doubted:
     """As `identify`, for a camera that nobody calibrated; what is told is believed first, then doubted.
 
     A stated field is searched up to MISSTATED wider and narrower in the end; a range of fields is believed. others: of
-    `identify`.
+    `identify`; work is for what is told, each doubt has its own. limit: LIMIT by default.
     """
+    limit = LIMIT if limit is None else limit
     xy_px, told = np.asarray(xy_px, dtype=float), {"flux": flux, "magnitude": magnitude, "sigma_px": sigma_px, **others}
     lens = {"fov_range": fov_range, "focal_sigma": focal_sigma}
     found = identify(xy_px, camera, limit=limit, work=work, **lens, **told)

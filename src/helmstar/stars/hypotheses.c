@@ -1,4 +1,4 @@
-/* Attitude hypotheses: what hypotheses.py does with NumPy (`_candidates`, `_best`), without arrays of hypotheses times detections.
+/* Attitude hypotheses: what hypotheses.py does with NumPy (`_chunk`, `_rank` and what they call), without arrays of hypotheses times detections.
 
    Arithmetic is that of the NumPy twin, operation by operation; only sums over detections and of three products may be rounded
    otherwise, which moves a direction that lies on the edge of a cell of the sky map into the next. */
@@ -6,7 +6,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#if defined(__GNUC__) && !defined(__clang__) && defined(__x86_64__) && defined(__linux__)
+#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
 #define EVERY_MACHINE __attribute__((target_clones("avx2", "default")))
 #else
 #define EVERY_MACHINE

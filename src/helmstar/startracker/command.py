@@ -183,6 +183,7 @@ DOUBTED = {
     "": "",
     "rough": "solved with a lens that displaces stars by pixels, brightness by its order alone: calibrate the camera",
     "field": "solved with another field than --fov says",
+    "rough, field": "solved with another field than --fov says, and a lens that displaces stars by pixels: calibrate the camera",
 }
 REASON = {
     "solved": "",
