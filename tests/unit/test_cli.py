@@ -190,7 +190,11 @@ def test_ctrl_c_in_a_real_process_keeps_what_is_finished(tmp_path):
         "width=4",
     ]
     argv += ["--estimators", "lie,mekf_tuned", "--out", str(tmp_path), "--json"]
-    process = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # Whoever runs the tests in a shell's background has handed down that Ctrl-C is ignored.
+    process = subprocess.Popen(
+        argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
     blocks = tmp_path / "blocks"
     for _ in range(1200):  # until blocks appear; a minute and more on a busy machine
         if blocks.exists() and len(list(blocks.glob("*.nc"))) >= 3:
