@@ -15,7 +15,7 @@ $(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit("helmstar needs Python 3.11 or later, this is " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv $(VENV)
 
-KERNELS := $(shell find src -name '*.c') hatch_build.py
+KERNELS := $(shell find src -name '*.[ch]') hatch_build.py
 
 $(USE): $(BIN)/python pyproject.toml constraints.txt $(KERNELS)
 	@echo "installing helmstar into $(VENV) (once)"

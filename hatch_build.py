@@ -41,7 +41,7 @@ def compile_kernels(package: Path) -> Path | None:
         )
         return None
     part = out.with_suffix(f".{os.getpid()}.part")
-    command = [*compiler.split(), *FLAGS, f"-DHELMSTAR_SOURCES={checksum(sources)}u"]
+    command = [*compiler.split(), *FLAGS, f"-DHELMSTAR_SOURCES={checksum(sorted(package.rglob('*.[ch]')))}u"]
     try:
         out.unlink(missing_ok=True)
         done = subprocess.run(

@@ -30,7 +30,7 @@ def kernels() -> Any | None:
     except (OSError, AttributeError):
         return None
     value = 0
-    for path in sorted(ROOT.rglob("*.c")):
+    for path in sorted(ROOT.rglob("*.[ch]")):
         value = zlib.crc32(path.read_bytes().replace(b"\r\n", b"\n"), value)
     return library if made_of == value else None
 

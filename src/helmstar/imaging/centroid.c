@@ -4,18 +4,10 @@
 #include <stdint.h>
 #include <string.h>
 
-#if defined(__linux__)
-#include <features.h>
-#endif
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define FAST __attribute__((target_clones("avx2", "default")))
-#else
-#define FAST
-#endif
+#include "../native.h"
 #if defined(__GNUC__) && !defined(__clang__)
 #pragma GCC diagnostic ignored "-Wpsabi" /* vectors are passed only between functions of this file that are inlined */
 #endif
-#define INLINE static inline __attribute__((always_inline))
 
 #define LANES 8
 #define MOST 35 /* widest window */

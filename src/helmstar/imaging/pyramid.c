@@ -2,15 +2,7 @@
    are taken in the order of NumPy's, and whole numbers stay exact in single precision, so both find the same places. */
 #include <stdint.h>
 
-#if defined(__linux__)
-#include <features.h>
-#endif
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define FAST __attribute__((target_clones("avx2", "default")))
-#else
-#define FAST
-#endif
-#define INLINE static inline __attribute__((always_inline))
+#include "../native.h"
 
 #define CHUNK 32 /* pixels that are compared before one is looked at */
 

@@ -4,15 +4,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#if defined(__linux__)
-#include <features.h>
-#endif
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define FAST __attribute__((target_clones("avx2", "default")))
-#else
-#define FAST
-#endif
-#define INLINE static inline __attribute__((always_inline))
+#include "../native.h"
 
 #define LANES 8
 #define BORDER 2

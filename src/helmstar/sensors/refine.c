@@ -7,11 +7,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define EVERY_MACHINE __attribute__((target_clones("avx2", "default")))
-#else
-#define EVERY_MACHINE
-#endif
+#include "../native.h"
 
 #define TINY 1e-13 /* information, in units in which it is about one, that everything has */
 #define ROW 8      /* 7 parameters and a zero, so that rows are whole vectors */
@@ -89,7 +85,7 @@ static void product(const double *A, const double *B, double *out)
 }
 
 /* As `Lens.predict` (lens.py), of all stars. */
-EVERY_MACHINE static void predict(const Problem *q, const Fit *fit, Room *room)
+FAST static void predict(const Problem *q, const Fit *fit, Room *room)
 {
     double a = q->aspect, f = q->focal * exp(fit->p[0]), fa = f / a, ex = fit->p[1], ey = fit->p[2];
     double k1 = q->distortion[0] + fit->p[3], k2 = q->distortion[1], p1 = q->distortion[2], p2 = q->distortion[3];
@@ -165,7 +161,7 @@ static void invert(double A[7][7], double *out)
 }
 
 /* As `_settle`, from the fit's step, covariance and scale. i, j: (count,) the matches. */
-EVERY_MACHINE static void settle(
+FAST static void settle(
     const Problem *q, const Room *room, Fit *fit, const int64_t *i, const int64_t *j, int64_t count, int rounds)
 {
     double size[7], *P = fit->covariance, *delta = fit->delta, other = 1.0 / (q->aspect * q->aspect);
@@ -238,7 +234,7 @@ static int64_t depth(const Problem *q, const Room *room, int64_t count)
 }
 
 /* As `_matched`, with the matches in the room; the number of them. A place that is no number matches nothing. */
-EVERY_MACHINE static int64_t match(const Problem *q, const Fit *fit, Room *room)
+FAST static int64_t match(const Problem *q, const Fit *fit, Room *room)
 {
     double P[7][ROW], most = 0.0, far = q->gate * q->gate;
     int64_t count = 0;

@@ -6,11 +6,7 @@
 #include <stdint.h>
 #include <string.h>
 
-#if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-#define EVERY_MACHINE __attribute__((target_clones("avx2", "default")))
-#else
-#define EVERY_MACHINE
-#endif
+#include "../native.h"
 
 #define BLOCK 128
 #define MOST 128 /* detections */
@@ -173,7 +169,7 @@ static inline __attribute__((always_inline)) void lay(const Run *run, const floa
 }
 
 /* Score (count,) of a block of hypotheses of one run. */
-EVERY_MACHINE static void score_block(
+FAST static void score_block(
     const Map *map, const Run *run, const float *stars, const float *magnitude, int32_t count, const int32_t *ab,
     const double *f, const float *zero, float *score)
 {
@@ -207,7 +203,7 @@ EVERY_MACHINE static void score_block(
 }
 
 /* Of one hypothesis, by all tests of its run. */
-EVERY_MACHINE static float score_one(
+FAST static float score_one(
     const Map *map, const Run *run, const float *va, const float *vb, const float *magnitude, double f, float zero)
 {
     float M[9], half = 0.5f * (float)map->side, almost = (float)(0.5 * map->side * (1.0 - 1e-6)), sum = 0.0f;

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..native import kernels
+from ..native import address, kernels
 from .patterns import EMPTY, FAINT, RUNG, SHORTEST, Level, Pairs, Sky, SkyMap
 from .verify import Detections, Freedom
 
@@ -300,7 +300,7 @@ _int, _int32, _float, _double = ctypes.c_int64, ctypes.c_int32, ctypes.c_float, 
 
 
 def _at(x: np.ndarray | None) -> ctypes.c_void_p:
-    return ctypes.c_void_p(None if x is None else x.__array_interface__["data"][0])
+    return ctypes.c_void_p(None if x is None else address(x))
 
 
 _kept = threading.local()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..native import kernels
+from ..native import address, kernels
 from .patterns import Sky
 from .verify import (
     BROAD_SHARE,
@@ -181,12 +181,12 @@ def _compiled(library: ctypes.CDLL, sky: Sky, level: int, d: Detections, cells: 
         zero_point=np.nan if d.zero_point is None else d.zero_point, faintest=d.faintest, f_low=freedom.f_low,
         f_high=freedom.f_high, f_known=freedom.f_known, f_sigma=freedom.sigma, gate=GATE, first_gate=FIRST_GATE,
         second_gate=SECOND_GATE, volume=SO3_VOLUME * focal_volume(freedom), zero_point_range=ZERO_POINT_RANGE,
-        broad_share=BROAD_SHARE, broad_sigma=broad_sigma(d), **{k: x.__array_interface__["data"][0] for k, x in arrays.items()},
+        broad_share=BROAD_SHARE, broad_sigma=broad_sigma(d), **{k: address(x) for k, x in arrays.items()},
     )  # fmt: skip
     R, f, odds = np.array(R, dtype=float, order="C"), np.array(f, dtype=float), np.empty(len(f))
     done = library.helmstar_screen
     done.restype = ctypes.c_int64
-    pointers = [ctypes.c_void_p(x.__array_interface__["data"][0]) for x in (R, f, odds)]
+    pointers = [ctypes.c_void_p(address(x)) for x in (R, f, odds)]
     if done(ctypes.byref(s), ctypes.c_int64(len(f)), *pointers) < 0:
         raise MemoryError("no room for the stars of a hypothesis")
     return odds, R, f
