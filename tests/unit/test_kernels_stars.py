@@ -15,6 +15,7 @@ from helmstar.native import kernels
 from helmstar.stars import Pinhole, default_sky, identify
 from helmstar.stars.identify import focal_freedom, prepare
 from helmstar.stars.patterns import BRIGHT, FAINT, LADDER, Pairs, Sky, SkyMap
+from helmstar.stars.stage import detection_pairs
 from helmstar.stars.synthetic import Scene, random_scene, scene
 
 hypotheses = importlib.import_module("helmstar.stars.hypotheses")
@@ -77,7 +78,7 @@ def test_lists_without_a_sky_are_refused_alike(flux):
 
 def chunks(d, freedom, level: int, part, keep: int):
     """All chunks of the first detection pairs."""
-    pairs = hypotheses.detection_pairs(d)[:10]
+    pairs = detection_pairs(d)[:10]
     return list(hypotheses.hypotheses(default_sky().level(level), BRIGHT, d, pairs, part, keep))
 
 

@@ -29,7 +29,8 @@ from ..native import address, kernels
 from ..stars.glance import quaternion_of
 from ..stars.identify import Identification, matrix_of_quaternion
 from ..stars.patterns import Sky
-from ..stars.verify import middle, turn
+from ..stars.problem import middle
+from ..stars.verify import turn
 from .lens import Lens, LensPrior
 
 EPOCH_SPREAD_YEARS = 25.0

@@ -11,12 +11,14 @@ import math
 
 import numpy as np
 
-from .hypotheses import detection_pairs, hypotheses, levels_for
+from .hypotheses import hypotheses, levels_for
 from .identify import FEWEST, Identification, focal_freedom, matrix_of_quaternion, prepare, unit_quaternion
 from .patterns import BRIGHT, LADDER, Sky
 from .pinhole import Camera
+from .problem import Fit
+from .stage import detection_pairs
 from .track import WIDEST_PX
-from .verify import GATE, SO3_VOLUME, Fit, probability_false, verify
+from .verify import GATE, SO3_VOLUME, probability_false, verify
 
 SHARE = 0.1
 """Of the limit on the probability that a solution is false: so much more may be false for having looked twice."""

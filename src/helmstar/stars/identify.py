@@ -10,11 +10,13 @@ import numpy as np
 
 from ..attitude import quaternion_of_matrix
 from .catalog import load_catalog
-from .hypotheses import CHUNK, FIRST_CHUNK, Hypotheses, Stage, detection_pairs, levels_for
+from .hypotheses import CHUNK, FIRST_CHUNK, Hypotheses, levels_for
 from .patterns import BRIGHT, BRIGHTEST, FAINT, LADDER, Sky
 from .pinhole import Camera, ideal_pixels
+from .problem import Detections, Fit, Freedom
 from .screen import Raster, raster, screen
-from .verify import HOPELESS, Detections, Fit, Freedom, jacobian, probability_false, turn, verify
+from .stage import Stage, detection_pairs
+from .verify import HOPELESS, jacobian, probability_false, turn, verify
 
 Status = Literal["solved", "too few stars", "no match", "uncertain"]
 
@@ -32,7 +34,7 @@ KEPT = 5
 DEPTHS = ((BRIGHTEST, 1.0), (BRIGHT, 1.0), (FAINT, 0.15))
 """Pair tables with how probable it is that they lead to a solution which the others miss. The first is for unknown fields."""
 WORTH = tuple(1.2e-8 * 2.0**k for k in range(10, -1, -1))
-"""Solutions that a look at one more catalogue pair must promise, from first to last (`hypotheses.Stage`)."""
+"""Solutions that a look at one more catalogue pair must promise, from first to last (`stage.Stage`)."""
 WORK = 6_000_000
 """Catalogue pairs, once for each way they are laid, that are looked at before the search gives up, whatever the next promises."""
 
@@ -387,24 +389,9 @@ def unsolved(status: Status, done: int, p_false: float = 1.0, odds: float = -np.
     nan, none = float("nan"), np.zeros(0, dtype=int)
     q = np.full(4, nan)
     return Identification(
-        status,
-        q,
-        q,
-        np.full((3, 3), nan),
-        nan,
-        nan,
-        nan,
-        none,
-        none,
-        none,
-        np.zeros((0, 2)),
-        nan,
-        nan,
-        nan,
-        p_false,
-        odds,
+        status, q, q, np.full((3, 3), nan), nan, nan, nan, none, none, none, np.zeros((0, 2)), nan, nan, nan, p_false, odds,
         done,
-    )
+    )  # fmt: skip
 
 
 __all__ = ["Identification", "default_sky", "identify"]

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..native import address, kernels
 from .patterns import Sky
+from .problem import Detections, Freedom
 from .verify import (
     BROAD_SHARE,
     GATE,
@@ -20,8 +21,6 @@ from .verify import (
     LOG_FACTORIAL,
     SO3_VOLUME,
     ZERO_POINT_RANGE,
-    Detections,
-    Freedom,
     broad_sigma,
     deepest,
     fit_volumes,
