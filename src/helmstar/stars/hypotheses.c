@@ -108,6 +108,8 @@ typedef struct {
 static inline __attribute__((always_inline)) int32_t taken(const Map *map, Hit *hit, int32_t hits)
 {
     int32_t kept = 0;
+    for (int32_t k = 0; k < hits; k++)
+        __builtin_prefetch(map->cells + hit[k].at);
     for (int32_t k = 0; k < hits; k++) {
         int32_t value = map->cells[hit[k].at];
         hit[kept] = (Hit){value, hit[k].hypothesis, hit[k].test};
