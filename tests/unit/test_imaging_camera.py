@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -46,6 +48,30 @@ def test_through_the_lens_and_back(distortion, fov_deg):
     d = camera.directions(xy)
     assert np.abs(np.linalg.norm(d, axis=1) - 1).max() < 1e-14
     assert np.abs(camera.pixels(d) - xy).max() < 1e-8
+
+
+@given(
+    distortion=st.tuples(*(st.floats(-b, b) for b in (0.6, 0.3, 0.01, 0.01, 0.1))), kept=st.tuples(*[st.booleans()] * 5),
+    focal=st.floats(600.0, 3000.0), u=st.floats(-0.5, 999.5), v=st.floats(-0.5, 799.5),
+)  # fmt: skip
+def test_one_pixel_in_plain_numbers_is_as_in_arrays(distortion, kept, focal, u, v):
+    camera = object.__new__(Camera)  # also one that would be refused
+    told: dict[str, Any] = {"width": 1000, "height": 800, "focal_px": focal, "centre_px": (480.0, 410.0), "aspect": 1.2}
+    told["distortion"] = tuple(d if k else 0.0 for d, k in zip(distortion, kept))
+    for name, value in told.items():
+        object.__setattr__(camera, name, value)
+    d = camera.directions(np.array([u, v]))
+    x, y = camera.plane(u, v)
+    assert np.isnan(x) == np.isnan(d[0])
+    if not np.isnan(x):
+        # Newton's last step is below 1e-15; near a fold the inverse carries that a thousandfold.
+        assert [x, y] == pytest.approx(d[:2] / d[2], abs=1e-12)
+    corners = np.array([[-0.5, -0.5], [999.5, -0.5], [-0.5, 799.5], [999.5, 799.5]])
+    if np.isfinite(camera.directions(corners)).all():
+        assert Camera(**told).plane(u, v) == (x, y)
+    else:
+        with pytest.raises(ValueError, match="folds"):
+            Camera(**told)
 
 
 def test_the_lens_is_opencv_s_formula():

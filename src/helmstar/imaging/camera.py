@@ -140,10 +140,13 @@ class Camera:
     def _reach(self) -> float:
         """The radius sqrt(x^2 + y^2) up to which the radial distortion grows; infinite for most lenses."""
         k1, k2, _, _, k3 = self.distortion
-        if not (k2 or k3):
-            return math.sqrt((1 - _FOLD) / (-3 * k1)) if k1 < -1e-9 else math.inf
-        slope = np.array([7 * k3, 5 * k2, 3 * k1, 1 - _FOLD])
-        slope[np.abs(slope) < 1e-9] = 0.0  # such a fold lies beyond 88 deg, and tiny leading terms spoil the roots
+        # Tiny terms fold beyond 88 deg, and spoil the roots.
+        a, b, c = (0.0 if abs(k) < 1e-9 else k for k in (3 * k1, 5 * k2, 7 * k3))
+        if not c:
+            square = a * a - 4 * b * (1 - _FOLD)
+            inverse = 0.5 * (math.sqrt(square) - a) / (1 - _FOLD) if square >= 0.0 else 0.0  # of r^2
+            return inverse**-0.5 if inverse > 0.0 else math.inf
+        slope = np.array([c, b, a, 1 - _FOLD])
         roots = np.roots(slope)
         real = roots.real[(np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots))) & (roots.real > 0)]
         return float(np.sqrt(real.min())) if real.size else math.inf
@@ -151,21 +154,18 @@ class Camera:
     def _folds(self) -> bool:
         """Whether a corner lies beyond what the distortion reaches."""
         k1, k2, p1, p2, k3 = self.distortion
-        corners = self._corners()
+        columns, rows = (-0.5, self.width - 0.5), (-0.5, self.height - 0.5)
         if p1 or p2:
-            return not bool(np.isfinite(self._plane(corners)).all())
+            return any(math.isnan(self.plane(u, v)[0]) for u in columns for v in rows)
         r = self._reach
         if math.isinf(r):
             return False
-        x, y = (corners[:, 0] - self.cx) / self.focal_px, (corners[:, 1] - self.cy) * (self.aspect / self.focal_px)
-        return bool(np.hypot(x, y).max() > r * (1 + r**2 * (k1 + r**2 * (k2 + r**2 * k3))))
+        x, y = max(abs(u - self.cx) for u in columns), max(abs(v - self.cy) for v in rows)
+        corner = math.hypot(x, self.aspect * y) / self.focal_px
+        return corner > r * (1 + r**2 * (k1 + r**2 * (k2 + r**2 * k3)))
 
-    def _corners(self) -> np.ndarray:
-        x, y = np.array([-0.5, self.width - 0.5]), np.array([-0.5, self.height - 0.5])
-        return np.stack(np.meshgrid(x, y), axis=-1).reshape(4, 2)
-
-    def distort(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
-        """x', y' and the derivatives dx'/dx, dx'/dy, dy'/dx, dy'/dy."""
+    def distort(self, x: Any, y: Any) -> tuple[Any, ...]:
+        """Of arrays or numbers x, y: x', y' and the derivatives dx'/dx, dx'/dy, dy'/dx, dy'/dy."""
         k1, k2, p1, p2, k3 = self.distortion
         r2 = x * x + y * y
         g = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -174,6 +174,27 @@ class Camera:
         yd = y * g + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         cross = h * x * y + 2 * p1 * x + 2 * p2 * y
         return xd, yd, g + h * x * x + 2 * p1 * y + 6 * p2 * x, cross, cross, g + h * y * y + 6 * p1 * y + 2 * p2 * x
+
+    def plane(self, u: float, v: float) -> tuple[float, float]:
+        """X/Z and Y/Z of the direction that is seen at one pixel, as `directions` in plain numbers; NaN where there is none."""
+        xd, yd = (u - self.cx) / self.focal_px, (v - self.cy) * (self.aspect / self.focal_px)
+        if not any(self.distortion):
+            return xd, yd
+        x, y, reach = xd, yd, self._reach
+        try:
+            for _ in range(_NEWTON_STEPS):
+                fx, fy, a, b, c, d = self.distort(x, y)
+                ex, ey, det = fx - xd, fy - yd, a * d - b * c
+                dx, dy = (d * ex - b * ey) / det, (a * ey - c * ex) / det
+                x, y = x - dx, y - dy
+                back = min(1.0, reach / max(math.hypot(x, y), 1e-300))  # see `_plane`
+                x, y = x * back, y * back
+                if not abs(dx) + abs(dy) > 1e-15:
+                    break
+            fx, fy = self.distort(x, y)[:2]
+        except (OverflowError, ZeroDivisionError):
+            return math.nan, math.nan
+        return (x, y) if math.hypot(fx - xd, fy - yd) < 1e-9 else (math.nan, math.nan)
 
     def _plane(self, xy_px: np.ndarray) -> np.ndarray:
         """x, y on the plane Z = 1 (..., 2): Newton's method on the distortion, started at the distorted place."""

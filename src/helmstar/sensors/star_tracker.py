@@ -246,7 +246,9 @@ class StarTracker:
     ) -> tuple[Refined, Doubt]:
         """The last fit, within what is known of the lens, and what had to be doubted for it."""
         if self.known is not None:
-            return refine(found, centroids, camera, self.sky, LensPrior.calibrated(self.known), self.epoch_years), doubt
+            lens = LensPrior.calibrated(self.known)
+            fit = refine(found, centroids, camera, self.sky, lens, self.epoch_years)
+            return _smooth(fit, self.known.smooth_px, camera), doubt
         if "field" in doubt:  # the fit must not lean on a statement that was wrong
             focal_sigma = math.inf
         first, floor = None, ROUGH_WIDTHS * camera.width
@@ -272,7 +274,7 @@ class StarTracker:
             few = first.scale < ROUGH_SCALE and first.strain < ROUGH_STRAIN and more < 1.4 * told + 1
             if few or rough.identification is found:
                 return first, doubt
-        return _smooth(rough, floor, camera), "rough" if doubt != "field" else "rough, field"
+        return _smooth(rough, SMOOTH_SHARE * floor, camera), "rough" if doubt != "field" else "rough, field"
 
     def _honest(self, centroids: Centroids) -> Centroids:
         """With the covariances that the calibration found."""
@@ -313,10 +315,10 @@ def _bright_share(fit: Refined, centroids: Centroids) -> float:
     return float((fit.identification.detections < count).sum() / max(count, 1))
 
 
-def _smooth(fit: Refined, displaced_px: float, camera: Camera) -> Refined:
-    """With what a lens's displacement does to all stars together, which more stars do not average: a share of it."""
+def _smooth(fit: Refined, sigma_px: float, camera: Camera) -> Refined:
+    """With what a lens's displacement does to all stars together, which more stars do not average: 1 sigma per axis."""
     i = fit.identification
-    sigma = SMOOTH_SHARE * displaced_px / fit.camera.focal_px
+    sigma = sigma_px / fit.camera.focal_px
     spread = math.hypot(camera.width, camera.height * camera.aspect) / math.sqrt(12.0) / fit.camera.focal_px
     return replace(fit, identification=replace(i, covariance=i.covariance + sigma**2 * np.diag([1.0, 1.0, spread**-2])))
 
@@ -361,41 +363,20 @@ def _solution(
 def centre_angles(camera: Camera, R_SN: np.ndarray) -> tuple[float, float, float]:
     """Right ascension, declination and roll in deg of the image's geometric centre: roll is north's direction there, from
     image up (-y), counter-clockwise as seen in the image."""
-    x, y = _centre_of(camera)
-    z = np.array([x, y, 1.0]) @ R_SN / math.sqrt(x * x + y * y + 1.0)
+    x, y = camera.plane(*camera.geometric_centre_px)
+    length, R = math.sqrt(x * x + y * y + 1.0), R_SN.tolist()
+    z = [(x * a + y * b + c) / length for a, b, c in zip(*R)]
     # A step north on the sky, seen in the image through the derivative of x/z, y/z and of the distortion. At a pole north is
     # everywhere; the limit along the step is taken.
-    north = np.array([0.0, 0.0, 1.0]) - z[2] * z
-    v = (R_SN @ north).tolist()
+    v = [R[k][2] - z[2] * u / length for k, u in enumerate((x, y, 1.0))]
     px, py = v[0] - x * v[2], v[1] - y * v[2]
-    _, _, xx, xy, yx, yy = _distorted(camera, x, y)
+    _, _, xx, xy, yx, yy = camera.distort(x, y)
     dx, dy = xx * px + xy * py, yx * px + yy * py
     roll = _turn(math.degrees(math.atan2(-dx, -dy)))
     return _turn(math.degrees(math.atan2(z[1], z[0]))), math.degrees(math.asin(max(-1.0, min(1.0, z[2])))), roll
-
-
-def _centre_of(camera: Camera) -> tuple[float, float]:
-    """X/Z and Y/Z of the direction seen at the image's geometric centre, in plain numbers."""
-    u, v = camera.geometric_centre_px
-    xd, yd = (u - camera.cx) / camera.focal_px, (v - camera.cy) * camera.aspect / camera.focal_px
-    x, y = xd, yd
-    if any(camera.distortion):
-        for _ in range(12):
-            fx, fy, a, b, c, d = _distorted(camera, x, y)
-            ex, ey, det = fx - xd, fy - yd, a * d - b * c
-            dx, dy = (d * ex - b * ey) / det, (a * ey - c * ex) / det
-            x, y = x - dx, y - dy
-            if abs(dx) + abs(dy) <= 1e-15:
-                break
-    return x, y
 
 
 def _turn(angle: float) -> float:
     """In [0, 360) deg: a remainder of a tiny negative number is 360 itself."""
     angle %= 360.0
     return angle if angle < 360.0 else 0.0
-
-
-def _distorted(camera: Camera, x: float, y: float) -> tuple[float, ...]:
-    """As the camera does it for arrays: x', y', and dx'/dx, dx'/dy, dy'/dx, dy'/dy."""
-    return camera.distort(x, y)  # pyright: ignore[reportArgumentType, reportReturnType]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -371,17 +372,20 @@ def polish(sky: Sky, d: Detections, C: np.ndarray, fit: Fit, freedom: Freedom):
 def unit_quaternion(name: str, q: np.ndarray) -> np.ndarray:
     """q (4,) normalised. Raises ValueError for what is no attitude."""
     q = np.asarray(q, dtype=float)
-    norm = float(np.sqrt((q**2).sum())) if q.shape == (4,) else np.nan
+    norm = math.sqrt(q @ q) if q.shape == (4,) else math.nan
     if not 0.5 < norm < 2.0:
         raise ValueError(f"{name} {q}: must be a unit quaternion, scalar last")
     return q / norm
 
 
 def matrix_of_quaternion(q: np.ndarray) -> np.ndarray:
-    """R (3, 3) of q (4,) scalar last."""
-    u, w = q[:3], q[3]
-    K = np.array([[0.0, -u[2], u[1]], [u[2], 0.0, -u[0]], [-u[1], u[0], 0.0]])
-    return np.eye(3) + 2.0 * (w * K + K @ K)
+    """R (3, 3) of q (4,) scalar last: as `attitude.matrix_of_quaternion`, in plain numbers."""
+    x, y, z, w = q.tolist()
+    return np.array([
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ])  # fmt: skip
 
 
 def unsolved(status: Status, done: int, p_false: float = 1.0, odds: float = -np.inf) -> Identification:

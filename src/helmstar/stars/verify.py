@@ -230,7 +230,8 @@ def verify(
 
 def _typical(fit: Fit, d: Detections) -> float:
     """Median residual of a fit over what the detections' sigmas promise."""
-    return middle(np.sqrt((fit.residuals**2).sum(axis=1)) / d.sigma[fit.detections]) / 1.18
+    x, y = fit.residuals.T
+    return middle(np.hypot(x, y) / d.sigma[fit.detections]) / 1.18
 
 
 class _InC(ctypes.Structure):
@@ -363,7 +364,7 @@ class _Field:
 def focal_volume(freedom: Freedom) -> float:
     """Of ln f before the fit."""
     if freedom.free:
-        return max(float(np.log(freedom.f_high / freedom.f_low)), 1e-3)
+        return max(math.log(freedom.f_high / freedom.f_low), 1e-3)
     # The Gaussian prior of ln f stands in the information; this is its norm.
     return math.sqrt(2.0 * math.pi) * max(freedom.sigma, 1e-6)
 
@@ -378,10 +379,10 @@ def fit_volumes(information: np.ndarray, freedom: Freedom, volume: float = SO3_V
 
 def probability_false(fits: list[Fit]) -> float:
     """Posterior probability that the best of the fits is not the true one: all false, or another fit; never quite zero."""
-    odds = np.array([fit.log_odds for fit in fits])
-    top = odds.max()
-    others = np.exp(-top) + np.exp(np.sort(odds)[:-1] - top).sum()
-    return float(max(others / (1.0 + others), LEAST_PROBABILITY))
+    *others, top = sorted(fit.log_odds for fit in fits)
+    most = max(top, 0.0)
+    false = sum(math.exp(odds - most) for odds in (0.0, *others))
+    return max(false / (false + math.exp(top - most)), LEAST_PROBABILITY)
 
 
 __all__ = ["probability_false", "verify"]
