@@ -78,14 +78,16 @@ def calibrate(frames: Sequence[Matches], start: Camera, fit: Sequence[str] = DEF
     return problem.result(p, R, len(frames))
 
 
-def derivative(camera: Camera, names: Sequence[str], directions_S: np.ndarray) -> np.ndarray:
-    """Derivative (n, 2, p) of the pixels of directions in S (n, 3) by parameters of the camera."""
+def derivative(camera: Camera, names: Sequence[str], directions_S: np.ndarray, turns: bool = False) -> np.ndarray:
+    """Derivative (n, 2, p) of the pixels of directions in S (n, 3) by parameters of the camera; with turns (n, 2, p + 3), by a
+    turn of S's axes last."""
     n = len(directions_S)
     one = _Problem(
         np.zeros((n, 2)), directions_S, np.ones(n), np.zeros(n, int), 1, camera, tuple(names), np.ones(len(names))
     )
     p = np.array([_get(camera, name) for name in names])
-    return one.residual(p, np.eye(3)[None])[1][:, :, : len(names)]
+    J = one.residual(p, np.eye(3)[None])[1]
+    return J if turns else J[:, :, : len(names)]
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from ..files import replacing, write_atomically
 from .camera import Camera, read_camera
 
 TABLE = "calibration"
-_NUMBERS = ("focal_sigma_px", "centre_sigma_px", "k1_sigma", "centroid_scale", "centroid_floor_px")
+NUMBERS = ("focal_sigma_px", "centre_sigma_px", "k1_sigma", "centroid_scale", "centroid_floor_px", "smooth_px")
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ class Calibrated:
     is None.
 
     centroid_scale, centroid_floor_px: the covariance of a centroid is scale^2 times the detection's, plus floor^2 on each axis.
+    smooth_px: 1 sigma per axis by which the lens moves neighbouring stars alike beyond what is fitted: more stars do not average it.
     dark: (height, width) float32 to subtract, or None.
     """
 
@@ -38,6 +39,7 @@ class Calibrated:
     k1_sigma: float | None = None
     centroid_scale: float = 1.0
     centroid_floor_px: float = 0.0
+    smooth_px: float = 0.0
     dark: np.ndarray | None = None
 
 
@@ -48,12 +50,12 @@ def read_calibrated(path: Path) -> Calibrated:
     table = tomllib.loads(path.read_text(encoding="utf-8")).get(TABLE, {})
     if not isinstance(table, dict):
         raise ConfigurationError(f"{path}: {TABLE} must be a table")
-    unknown = sorted(set(table) - {*_NUMBERS, "dark"})
+    unknown = sorted(set(table) - {*NUMBERS, "dark"})
     if unknown:
-        known = ", ".join((*_NUMBERS, "dark"))
+        known = ", ".join((*NUMBERS, "dark"))
         raise ConfigurationError(f"{path}: [{TABLE}] has the unknown key {unknown[0]!r}; known: {known}")
     numbers: dict[str, float] = {}
-    for key in _NUMBERS:
+    for key in NUMBERS:
         value = table.get(key)
         if value is None:
             continue
@@ -110,4 +112,4 @@ def write_calibrated(path: Path, camera: Camera, lines: list[str]) -> None:
     write_atomically(Path(path), camera.to_toml() + f"\n[{TABLE}]\n" + "\n".join(lines) + "\n")
 
 
-__all__ = ["Calibrated", "read_calibrated", "read_dark", "write_calibrated", "write_dark"]
+__all__ = ["NUMBERS", "Calibrated", "read_calibrated", "read_dark", "write_calibrated", "write_dark"]

@@ -47,8 +47,9 @@ class LensPrior:
         return cls(focal, centre, 0.001 / corner**2 if known.k1_sigma is None else known.k1_sigma)
 
 
-def lens_sigmas(fit: Calibration) -> tuple[float, float, float]:
-    """1 sigma of focal length (relative), centre (px) and k1 that move pixels as a calibration's whole covariance does.
+def lens_sigmas(fit: Calibration) -> tuple[float, float, float, float]:
+    """1 sigma of focal length (relative), centre (px) and k1 that move pixels as a calibration's whole covariance does, and of
+    the rest (px per axis).
 
     A calibration's parameters are correlated, and more than `LensPrior` has: what they leave open of the image, over a grid, is
     projected on turns (which belong to the attitude), focal length, centre and k1.
@@ -63,7 +64,9 @@ def lens_sigmas(fit: Calibration) -> tuple[float, float, float]:
     scale = np.linalg.norm(J, axis=0)
     A = np.linalg.lstsq(J / scale, open_, rcond=1e-6)[0] / scale[:, None]
     sigma = np.sqrt(np.maximum(np.diagonal(A @ fit.covariance @ A.T), 0.0))
-    return float(sigma[3]), float(max(sigma[4], sigma[5] * camera.aspect)), float(sigma[6])
+    B = open_ - J @ A
+    rest = float(np.sqrt(max(np.trace(B @ fit.covariance @ B.T) / len(B), 0.0)))
+    return float(sigma[3]), float(max(sigma[4], sigma[5] * camera.aspect)), float(sigma[6]), rest
 
 
 @dataclass(frozen=True)

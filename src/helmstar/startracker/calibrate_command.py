@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import DataError
 from ..files import readable
 from ..imaging import DetectionSettings, dark_of, detect
-from ..imaging.calibrated import write_calibrated, write_dark
+from ..imaging.calibrated import NUMBERS, write_calibrated, write_dark
 from ..progress import Progress
 from ..sensors.star_tracker import StarTracker
 from ..stars.identify import matrix_of_quaternion
@@ -171,6 +171,7 @@ def _result(frames: list[Frame], fitted: Fitted) -> dict[str, Any]:
         "sigma": {n: c.sigma(n) for n in c.names},
         "focal_sigma_px": known.focal_sigma_px, "centre_sigma_px": known.centre_sigma_px, "k1_sigma": known.k1_sigma,
         "centroid_scale": known.centroid_scale, "centroid_floor_px": known.centroid_floor_px,
+        "smooth_px": known.smooth_px,
         "frames": len(fitted.frames), "stars": int(sum(k.sum() for k in c.kept)),
         "outliers": int(sum((~k).sum() for k in c.kept)), "chi2": c.chi2, "degrees": c.degrees,
         "rms_before_arcsec": _rms(everything[0]) / camera.focal_px * degrees,
@@ -186,9 +187,11 @@ def _rms(residual: np.ndarray) -> float:
 
 def _lines(result: dict[str, Any], dark: Path | None) -> list[str]:
     """Of the table [calibration]."""
-    numbers = ("focal_sigma_px", "centre_sigma_px", "k1_sigma", "centroid_scale", "centroid_floor_px")
-    lines = ["# 1 sigma of what the calibration leaves open, seen as three numbers; and of what centroids promise:"]
-    lines += [f"{key} = {float(result[key])!r}" for key in numbers]
+    lines = [
+        "# 1 sigma of what the calibration leaves open, seen as three numbers; of what centroids promise; and by which the lens",
+        "# moves neighbouring stars alike beyond what was fitted:",
+    ]
+    lines += [f"{key} = {float(result[key])!r}" for key in NUMBERS]
     if dark is not None:
         lines.append(
             f"dark = {json.dumps(readable(dark.name), ensure_ascii=False)}  # what shines in {result['dark_pixels']} pixels"
@@ -225,7 +228,7 @@ def print_calibrated(result: dict[str, Any]) -> None:
         f"{result['stars']} stars in {result['frames']} of {len(result['images'])} images, {result['outliers']} outliers, "
         f"residual {result['rms_before_arcsec']:.3g} -> {result['residual_rms_arcsec']:.3g} arcsec, chi2/dof "
         f"{result['chi2'] / result['degrees']:.2f} with sigma {result['centroid_scale']:.2f} times what centroids promise and "
-        f"{result['centroid_floor_px']:.3f} px"
+        f"{result['centroid_floor_px']:.3f} px; the lens moves neighbours alike by another {result['smooth_px']:.3f} px"
     )
     if result["dark"]:
         print(f"dark: {result['dark_pixels']} pixels, {result['dark']}")

@@ -12,6 +12,7 @@ from ..errors import DataError
 from ..imaging import Camera, Centroids
 from ..imaging.calibrate import DEFAULT, Calibration, Matches, calibrate
 from ..imaging.calibrated import Calibrated
+from ..imaging.unexplained import shared_px
 from ..sensors.lens import LensPrior, lens_sigmas
 from ..sensors.refine import refine
 from ..sensors.star_tracker import StarSolution, StarTracker
@@ -72,13 +73,13 @@ def fit_camera(tracker: StarTracker, frames: Sequence[Frame], aspect: bool) -> F
         noise = _noise(tracker, mine, data, fitted)
         camera = fitted.camera
         if k < _ROUNDS - 1:
-            _match_again(tracker, frames, mine, fitted, _known(fitted, noise), noise)
+            _match_again(tracker, frames, mine, fitted, _known(fitted, data, noise), noise)
     mine = [f for f in frames if f.solved]
     data = [_matches(tracker, f, noise) for f in mine]
     fitted = _calibrated(data, camera, aspect)
     first = calibrate(data, start, ())
     return Fitted(
-        fitted, _known(fitted, noise), mine, [m.xy_px for m in data], residuals(data, start, first.q_SN),
+        fitted, _known(fitted, data, noise), mine, [m.xy_px for m in data], residuals(data, start, first.q_SN),
         residuals(data, fitted.camera, fitted.q_SN),
     )  # fmt: skip
 
@@ -118,10 +119,11 @@ def _calibrated(data: list[Matches], start: Camera, aspect: bool) -> Calibration
     return calibrate(data, start, SIMPLER[-1])
 
 
-def _known(fitted: Calibration, noise: tuple[float, float]) -> Calibrated:
+def _known(fitted: Calibration, data: Sequence[Matches], noise: tuple[float, float]) -> Calibrated:
     """The camera with what the calibration leaves open."""
-    focal, centre, k1 = lens_sigmas(fitted)
-    return Calibrated(fitted.camera, focal * fitted.camera.focal_px, centre, k1, *noise)
+    focal, centre, k1, rest = lens_sigmas(fitted)
+    smooth = float(np.hypot(rest, shared_px(data, fitted)))
+    return Calibrated(fitted.camera, focal * fitted.camera.focal_px, centre, k1, *noise, smooth)
 
 
 def _noise(
