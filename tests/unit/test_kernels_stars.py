@@ -13,13 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from helmstar.native import kernels
 from helmstar.stars import Pinhole, default_sky, identify
-from helmstar.stars.identify import focal_freedom, prepare
+from helmstar.stars.identify import focal_freedom
 from helmstar.stars.patterns import BRIGHT, FAINT, LADDER, Pairs, Sky, SkyMap
+from helmstar.stars.problem import prepare
 from helmstar.stars.stage import detection_pairs
 from helmstar.stars.synthetic import Scene, random_scene, scene
 
 hypotheses = importlib.import_module("helmstar.stars.hypotheses")
 screening = importlib.import_module("helmstar.stars.screen")
+others = [importlib.import_module(f"helmstar.stars.{m}") for m in ("patterns", "problem", "verify")]
 pytestmark = pytest.mark.skipif(
     kernels() is None, reason="installed without compiled kernels, or their sources changed since"
 )
@@ -28,7 +30,7 @@ pytestmark = pytest.mark.skipif(
 def with_numpy(call, *args, **kinds):
     """What `call` gives without the compiled kernels."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (hypotheses, screening):
+        for module in (hypotheses, screening, *others):
             patch.setattr(module, "kernels", lambda: None)
         return call(*args, **kinds)
 

@@ -11,8 +11,9 @@ import pytest
 from helmstar.native import kernels
 from helmstar.stars import Pinhole, default_sky
 from helmstar.stars.hypotheses import levels_for
-from helmstar.stars.identify import focal_freedom, prepare
+from helmstar.stars.identify import focal_freedom
 from helmstar.stars.patterns import LADDER
+from helmstar.stars.problem import prepare
 from helmstar.stars.synthetic import random_scene, scene
 
 # The package's `verify` is the function.

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from helmstar.attitude import quest
 from helmstar.stars import Pinhole, Sky, default_sky, identify, load_catalog, patterns, track
 from helmstar.stars.hypotheses import levels_for
-from helmstar.stars.identify import focal_freedom, prepare
+from helmstar.stars.identify import focal_freedom
 from helmstar.stars.pinhole import ideal_pixels, image_pixels
+from helmstar.stars.problem import prepare
 from helmstar.stars.screen import raster, screen
 from helmstar.stars.synthetic import random_scene, scene
 from helmstar.stars.verify import verify

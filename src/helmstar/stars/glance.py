@@ -12,10 +12,10 @@ import math
 import numpy as np
 
 from .hypotheses import hypotheses, levels_for
-from .identify import FEWEST, Identification, focal_freedom, matrix_of_quaternion, prepare, unit_quaternion
+from .identify import FEWEST, Identification, focal_freedom, matrix_of_quaternion, unit_quaternion
 from .patterns import BRIGHT, LADDER, Sky
 from .pinhole import Camera
-from .problem import Fit
+from .problem import Fit, prepare
 from .stage import detection_pairs
 from .track import WIDEST_PX
 from .verify import GATE, SO3_VOLUME, probability_false, verify

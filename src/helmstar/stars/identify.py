@@ -13,16 +13,14 @@ from ..attitude import quaternion_of_matrix
 from .catalog import load_catalog
 from .hypotheses import CHUNK, FIRST_CHUNK, Hypotheses, levels_for
 from .patterns import BRIGHT, BRIGHTEST, FAINT, LADDER, Sky
-from .pinhole import Camera, ideal_pixels
-from .problem import Detections, Fit, Freedom
+from .pinhole import Camera
+from .problem import Detections, Fit, Freedom, prepare
 from .screen import Raster, raster, screen
 from .stage import Stage, detection_pairs
 from .verify import HOPELESS, jacobian, probability_false, turn, verify
 
 Status = Literal["solved", "too few stars", "no match", "uncertain"]
 
-MOST_DETECTIONS = 120
-"""The brightest of a longer list are used."""
 FEWEST = 3
 """Stars that a solution must match; with a known zero point of magnitudes 2 may do."""
 LIMIT = 1e-5
@@ -123,103 +121,6 @@ def identify(
         return unsolved("too few stars", 0)
     fits, done = search(sky, d, freedom, fewest, limit, work)
     return conclude(sky, d, covariances, freedom, fits, done, fewest, limit, q_SB)
-
-
-def prepare(
-    xy_px: np.ndarray,
-    camera: Camera,
-    flux: np.ndarray | None,
-    magnitude: np.ndarray | None,
-    sigma_px: float | np.ndarray,
-    magnitude_sigma: float,
-    zero_point: float | None,
-) -> tuple[Detections, np.ndarray]:
-    """Detections in ideal pixels, brightest first, and their covariances (n, 2, 2). Raises ValueError for what means nothing."""
-    xy = np.asarray(xy_px, dtype=float)
-    if xy.size == 0:
-        xy = xy.reshape(0, 2)
-    if xy.ndim != 2 or xy.shape[1] != 2:
-        raise ValueError(f"xy_px {xy.shape}: must be (n, 2)")
-    n = len(xy)
-    if flux is not None and magnitude is not None:
-        raise ValueError("flux and magnitude: must be one or the other")
-    if not magnitude_sigma > 0.0:
-        raise ValueError(f"magnitude_sigma {magnitude_sigma}: must be positive")
-    m = None
-    if flux is not None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            m = -2.5 * np.log10(np.asarray(flux, dtype=float))
-    elif magnitude is not None:
-        m = np.asarray(magnitude, dtype=float)
-    if m is not None and m.shape != (n,):
-        raise ValueError(f"brightness {m.shape}: must have one entry for each of the {n} positions")
-    sigma = np.asarray(sigma_px, dtype=float)
-    if sigma.shape not in ((), (n,), (n, 2, 2)):
-        raise ValueError(f"sigma_px {sigma.shape}: must be a number, ({n},) or ({n}, 2, 2)")
-    stretch = np.array([1.0, camera.aspect])
-    if sigma.ndim == 3:
-        C = sigma * stretch[:, None] * stretch
-    else:
-        C = np.broadcast_to(sigma**2, (n,))[:, None, None] * np.diag(stretch**2)
-    good = np.isfinite(xy).all(axis=1) & (C[:, 0, 0] > 0) & (C[:, 0, 0] * C[:, 1, 1] > C[:, 0, 1] ** 2)
-    good &= np.isfinite(C).all(axis=(1, 2))
-    if m is not None:
-        good &= np.isfinite(m)
-    order = np.flatnonzero(good)
-    if m is not None:
-        order = order[np.argsort(m[order], kind="stable")]
-    corners = np.array([[0.0, 0.0], [camera.size_px[0], camera.size_px[1]]])
-    low, high = (corners - np.asarray(camera.centre_px)) * stretch
-    p = ideal_pixels(camera, xy[order])
-    # One star counts once: of detections closer than a pixel the brightest stays.
-    keep = np.ones(len(order), dtype=bool)
-    crowded = np.flatnonzero(_crowded(p))
-    for k in crowded:
-        before = keep[:k] & (np.abs(p[:k] - p[k]).max(axis=1) < 1.0)
-        keep[k] = not before.any()
-    if len(crowded):
-        order, p = order[keep], p[keep]
-    order, p = order[:MOST_DETECTIONS], p[:MOST_DETECTIONS]
-    C = C[order]
-    brightness = None if m is None else m[order]
-    per_axis = np.sqrt(0.5 * (C[:, 0, 0] + C[:, 1, 1]))
-    density = _log_density(brightness) if brightness is not None and len(order) else np.zeros(len(order))
-    places = _log_place_density(p, float(np.prod(high - low)))
-    d = Detections(p, per_axis, brightness, magnitude_sigma, zero_point, density, places, low, high, order)
-    return d, C
-
-
-def _crowded(p: np.ndarray) -> np.ndarray:
-    """(n,) whether anything else lies within a pixel; cheap for the usual list, where nothing does."""
-    if len(p) < 2:
-        return np.zeros(len(p), dtype=bool)
-    order = np.argsort(p[:, 0], kind="stable")
-    x = p[order, 0]
-    close = np.flatnonzero(x[1:] - x[:-1] < 1.0)
-    out = np.zeros(len(p), dtype=bool)
-    out[order[close]] = out[order[close + 1]] = True
-    return out
-
-
-def _log_density(m: np.ndarray) -> np.ndarray:
-    """Log density (n,) 1/mag of the detections' own magnitudes: half a smoothed count, half even over their range."""
-    width = 0.5
-    z = (m[:, None] - m[None, :]) / width
-    smooth = np.exp(-0.5 * z * z).sum(axis=1) / len(m) / (width * np.sqrt(2.0 * np.pi))
-    even = 1.0 / (m.max() - m.min() + 2.0 * width)
-    return np.log(0.5 * smooth + 0.5 * even)
-
-
-def _log_place_density(p: np.ndarray, area: float) -> np.ndarray:
-    """Log density (n,) 1/px^2 of the detections, one more counted: half even over the image, half smoothed from the others."""
-    n = len(p)
-    if n < 2:
-        return np.full(n, np.log((n + 1.0) / area))
-    width = 0.5 * np.sqrt(area / n)
-    dx, dy = p[:, :1] - p[:, 0], p[:, 1:] - p[:, 1]
-    square = dx * dx + dy * dy
-    others = np.exp(-0.5 / width**2 * square).sum(axis=1) - 1.0
-    return np.log(0.5 / area + 0.5 * others / (n - 1.0) / (2.0 * np.pi * width**2)) + np.log(n + 1.0)
 
 
 def focal_freedom(camera: Camera, fov_range: tuple[float, float] | None, focal_sigma: float) -> Freedom:

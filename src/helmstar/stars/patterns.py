@@ -8,6 +8,7 @@ string switches it off), with a version and a checksum; a file that is stale or 
 
 from __future__ import annotations
 
+import ctypes
 import math
 import os
 import tempfile
@@ -15,9 +16,11 @@ import zlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from ..native import address, kernels
 from .catalog import Catalog
 
 VERSION = 1
@@ -228,6 +231,21 @@ class Level:
         return self._maps[key]
 
 
+class Window(NamedTuple):
+    """What a pinhole at R (3, 3) sees with (X/Z, Y/Z) from low (2,) to high (2,)."""
+
+    R: np.ndarray
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+    def shows(self, directions: np.ndarray) -> np.ndarray:
+        """Which directions (n, 3) in N; bool (n,)."""
+        v = directions @ self.R.T
+        z = v[:, 2]
+        u = v[:, :2] / np.maximum(z, 1e-3)[:, None]
+        return (z > 1e-3) & (u >= self.low).all(axis=1) & (u <= self.high).all(axis=1)
+
+
 class Sky:
     """The catalogue as one camera sees it: directions at a year and for an observer's velocity, and the tables.
 
@@ -254,9 +272,9 @@ class Sky:
         """Tables of LADDER[i]."""
         return self._shared.level(i)
 
-    def near(self, i: int, centre: np.ndarray, radius: float) -> np.ndarray:
-        """Catalogue indices, brightest first, of level i's deep stars within `radius` (rad) of a direction (3,)."""
-        return _in_circle(*self.deep(i), centre, radius)
+    def near(self, i: int, centre: np.ndarray, radius: float, window: Window | None = None) -> np.ndarray:
+        """Catalogue indices, brightest first, of level i's deep stars within `radius` (rad) of a direction (3,) and in a window."""
+        return self._in_circle(*self.deep(i), centre, radius, window)
 
     def deep(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Catalogue indices (m,) of level i's deep stars by declination, and their directions (m, 3)."""
@@ -264,28 +282,45 @@ class Sky:
             self._deep[i] = self._banded(self.level(i).members(DEEP))
         return self._deep[i]
 
-    def around(self, centre: np.ndarray, radius: float) -> np.ndarray:
-        """Indices, brightest first, of all the catalogue's stars within `radius` (rad) of a direction (3,)."""
+    def around(self, centre: np.ndarray, radius: float, window: Window | None = None) -> np.ndarray:
+        """As `near`, of all the catalogue's stars."""
         if self._whole is None:
             self._whole = self._banded(np.arange(len(self.directions)))
-        return _in_circle(*self._whole, centre, radius)
+        return self._in_circle(*self._whole, centre, radius, window)
 
     def _banded(self, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Members by declination, and their directions. Importing scipy's trees would take the first solution 0.5 s."""
+        if len(members) and not 0 <= members.min() <= members.max() < len(self.directions):
+            raise ValueError("a table names stars that are not in the catalogue: it was made from another one")
         members = members[np.argsort(self.directions[members, 2], kind="stable")]
         return np.ascontiguousarray(members, dtype=np.int64), np.ascontiguousarray(
             self.directions[members], dtype=float
         )
 
-
-def _in_circle(members: np.ndarray, directions: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    """Those of the members, sorted by declination as their directions, within `radius` (rad) of a direction, ascending."""
-    dec = math.asin(max(-1.0, min(1.0, float(centre[2]))))
-    low, high = (math.sin(max(-0.5 * math.pi, min(0.5 * math.pi, dec + r))) for r in (-radius, radius))
-    begin, end = directions[:, 2].searchsorted([low - 1e-12, high + 1e-12])
-    found = members[begin:end][directions[begin:end] @ centre > math.cos(radius)]
-    found.sort()
-    return found
+    def _in_circle(
+        self, members: np.ndarray, directions: np.ndarray, centre: np.ndarray, radius: float, window: Window | None
+    ) -> np.ndarray:
+        """Of the members, sorted by declination as their directions, by sky.c where it is compiled."""
+        library = kernels()
+        if library is not None:
+            found = np.empty(len(members), dtype=np.int64)
+            count = library.helmstar_in_circle(
+                ctypes.c_int64(len(members)), ctypes.c_int64(len(self.directions)), ctypes.c_void_p(address(members)),
+                ctypes.c_void_p(address(directions)), (ctypes.c_double * 3)(*centre), ctypes.c_double(radius),
+                None if window is None else (ctypes.c_double * 13)(*window.R.ravel().tolist(), *window.low, *window.high),
+                ctypes.c_void_p(address(found)),
+            )  # fmt: skip
+            if count < 0:
+                raise MemoryError("no room for the stars of an image")
+            return found[:count].copy()
+        dec = math.asin(max(-1.0, min(1.0, float(centre[2]))))
+        low, high = (math.sin(max(-0.5 * math.pi, min(0.5 * math.pi, dec + r))) for r in (-radius, radius))
+        begin, end = directions[:, 2].searchsorted([low - 1e-12, high + 1e-12])
+        members, directions = members[begin:end], directions[begin:end]
+        inside = directions @ centre > math.cos(radius)
+        if window is not None:
+            inside &= window.shows(directions)
+        return np.sort(members[inside])
 
 
 def aberrated(directions: np.ndarray, velocity_c: np.ndarray | None) -> np.ndarray:
@@ -332,4 +367,4 @@ def _shared_tables(catalog: Catalog) -> _Shared:
     return _tables[key]
 
 
-__all__ = ["LADDER", "RUNG", "Level", "Pairs", "Sky", "SkyMap", "aberrated", "build_pairs", "build_sky_map"]
+__all__ = ["LADDER", "RUNG", "Level", "Pairs", "Sky", "SkyMap", "Window", "aberrated", "build_pairs", "build_sky_map"]

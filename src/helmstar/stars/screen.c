@@ -1,6 +1,6 @@
 /* A first weighing of hypotheses: what screen.py does with NumPy, one hypothesis after the other. */
-#include <math.h>
-#include <stdint.h>
+#include "sky.h"
+
 #include <stdlib.h>
 #include <string.h>
 
@@ -36,26 +36,12 @@ static int by_rank(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-/* First of the members, by declination, whose z is not less. */
-static int64_t first_above(const Screen *s, double z)
-{
-    int64_t low = 0, high = s->members;
-    while (low < high) {
-        int64_t middle = low + (high - low) / 2;
-        if (s->member_directions[3 * middle + 2] < z)
-            low = middle + 1;
-        else
-            high = middle;
-    }
-    return low;
-}
-
 static double within(double x, double low, double high) { return x < low ? low : x > high ? high : x; }
 
-/* Catalogue stars in a circle around the image, the brightest first: as `stars_near`. A set bit for each star, and all of `marks` clear
-   before and after, sorts them. */
-static int64_t stars_near(const Screen *s, const double *R, double f, uint8_t *marks, int64_t *found)
+/* Catalogue stars in a circle around the image, the brightest first: as `stars_near`. */
+static int64_t stars_near(const Screen *s, const double *R, double f, uint64_t *marks, int64_t *found)
 {
+    Members all = {s->members, s->stars, s->member, s->member_directions};
     double mx = 0.5 * (s->low[0] + s->high[0]), my = 0.5 * (s->low[1] + s->high[1]), axis[3], norm = 0.0;
     for (int c = 0; c < 3; c++) {
         axis[c] = R[c] * mx + R[3 + c] * my + R[6 + c] * f;
@@ -63,23 +49,8 @@ static int64_t stars_near(const Screen *s, const double *R, double f, uint8_t *m
     }
     for (int c = 0; c < 3; c++)
         axis[c] /= sqrt(norm);
-    double hx = 0.5 * (s->high[0] - s->low[0]), hy = 0.5 * (s->high[1] - s->low[1]), quarter = 0.5 * 3.14159265358979323846;
-    double radius = 1.03 * atan(sqrt(hx * hx + hy * hy) / f), dec = asin(within(axis[2], -1.0, 1.0)), least = cos(radius);
-    int64_t begin = first_above(s, sin(within(dec - radius, -quarter, quarter)) - 1e-12);
-    int64_t end = first_above(s, sin(within(dec + radius, -quarter, quarter)) + 1e-12), count = 0;
-    for (int64_t k = begin; k < end; k++) {
-        const double *v = s->member_directions + 3 * k;
-        if (v[0] * axis[0] + v[1] * axis[1] + v[2] * axis[2] > least)
-            marks[s->member[k] >> 3] |= (uint8_t)(1 << (s->member[k] & 7));
-    }
-    for (int64_t word = 0; 8 * word < s->stars; word++)
-        if (marks[word]) {
-            for (int64_t bit = 0; bit < 8; bit++)
-                if (marks[word] >> bit & 1)
-                    found[count++] = 8 * word + bit;
-            marks[word] = 0;
-        }
-    return count;
+    double hx = 0.5 * (s->high[0] - s->low[0]), hy = 0.5 * (s->high[1] - s->low[1]);
+    return in_circle(&all, axis, 1.03 * atan(sqrt(hx * hx + hy * hy) / f), NULL, marks, found);
 }
 
 /* Matches under one attitude, each detection with the nearest of the stars that find it; *expected: stars seen. */
@@ -271,7 +242,7 @@ int64_t helmstar_screen(const Screen *s, int64_t h, double *R, double *f, double
     if (s->n < 1 || s->n > MOST || s->most > 390 || s->members < 0)
         return -1;
     int64_t *star = malloc(sizeof(int64_t) * (size_t)(s->members + 1));
-    uint8_t *marks = calloc((size_t)(s->stars / 8 + 1), 1);
+    uint64_t *marks = calloc((size_t)words(s->stars), sizeof(uint64_t));
     if (star == NULL || marks == NULL) {
         free(star);
         free(marks);

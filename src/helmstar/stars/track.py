@@ -14,12 +14,12 @@ from .identify import (
     focal_freedom,
     identify,
     matrix_of_quaternion,
-    prepare,
     unit_quaternion,
     unsolved,
 )
 from .patterns import LADDER, Sky
 from .pinhole import Camera
+from .problem import prepare
 from .verify import SO3_VOLUME, verify
 
 WIDEST_PX = 40.0

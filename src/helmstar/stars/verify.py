@@ -27,7 +27,7 @@ from functools import cached_property
 import numpy as np
 
 from ..native import address, kernels
-from .patterns import Sky
+from .patterns import Sky, Window
 from .problem import Detections, Fit, Freedom, middle
 
 BROAD_SHARE, BROAD_SIGMA, BROAD_FACTOR = 0.15, 1.5, 6.0
@@ -83,18 +83,22 @@ def deepest(d: Detections) -> int:
 
 def stars_near(sky: Sky, level: int, R: np.ndarray, f: float, d: Detections) -> np.ndarray:
     """Catalogue indices, brightest first, of a circle around the image, at one attitude."""
-    middle = 0.5 * (d.low + d.high)
-    axis = R.T @ np.array([middle[0], middle[1], f])
-    half = 0.5 * (d.high - d.low)
-    return sky.near(level, axis / np.sqrt(axis @ axis), 1.03 * float(np.arctan(np.sqrt(half @ half) / f)))
+    return sky.near(level, *_circle(R, f, d))
+
+
+def _circle(R: np.ndarray, f: float, d: Detections) -> tuple[np.ndarray, float]:
+    """Middle (3,) and radius (rad) of a circle around the image."""
+    (left, top), (right, bottom) = d.low.tolist(), d.high.tolist()
+    axis = np.array([0.5 * (left + right), 0.5 * (top + bottom), f]) @ R
+    return axis / math.sqrt(axis @ axis), 1.03 * math.atan(0.5 * math.hypot(right - left, bottom - top) / f)
 
 
 def expected_stars(sky: Sky, level: int, R: np.ndarray, f: float, d: Detections, limit: int) -> np.ndarray:
     """Catalogue indices, brightest first, of what may be in the image or just beyond its edge: about `limit` at most."""
-    stars = stars_near(sky, level, R, f, d)
-    p, front = project(sky.directions.take(stars, axis=0), R, f)
-    margin = 0.05 * (d.high - d.low)
-    return stars[front & inside(p, d.low - margin, d.high + margin)][: limit + limit // 2]
+    (left, top), (right, bottom) = d.low.tolist(), d.high.tolist()
+    x, y = 0.05 * (right - left), 0.05 * (bottom - top)
+    window = Window(R, ((left - x) / f, (top - y) / f), ((right + x) / f, (bottom + y) / f))
+    return sky.near(level, *_circle(R, f, d), window)[: limit + limit // 2]
 
 
 def project(r: np.ndarray, R: np.ndarray, f: float) -> tuple[np.ndarray, np.ndarray]:
