@@ -1,4 +1,4 @@
-/* One hypothesis matched, stepped and weighed: what `_Field.settle` of verify.py does with NumPy, from the start to the fit.
+/* One hypothesis matched, stepped and weighed: what `_Field.settle` of verify.py does with NumPy, from the start to the best fit.
 
    Formulas, gates and ties are those of the NumPy twin; only the order of sums differs. */
 #include <math.h>
@@ -7,7 +7,7 @@
 
 #define MOST 512  /* detections */
 #define DEEP 398  /* stars, for which the table of factorials has one more */
-#define HEAD 28   /* numbers of a fit before its residuals: R (3, 3), f, log odds, zero point, information (4, 4) */
+#define HEAD 29   /* numbers of a fit before its residuals: R (3, 3), f, log odds, zero point, information (4, 4), scale */
 
 static const double TURN = 2.0 * 3.14159265358979323846;
 
@@ -281,18 +281,14 @@ static double weigh(
     return log_odds(q, m, good, expected) + price - log(scale) + left;
 }
 
-/* Matches and steps `rounds` times from R and f, the head of `fit`, then matches and weighs. Number of matches: star and j (limit,)
-   are theirs, and the residuals (2 limit,) after the fit's head. 0 where fewer than two stars fit or nothing speaks for it, -1 where
-   sizes are out of range, -2 where a step has no solution. */
-int64_t helmstar_settle(
+/* As `_Field._at_scale`, from R and f, the head of `fit`. */
+static int64_t at_scale(
     const Field *q, double scale, double first_gate, int64_t rounds, double *fit, int64_t *star, int64_t *detection)
 {
     Seen seen[DEEP];
     Match m[DEEP];
     double *R = fit, *f = fit + 9, zero = q->zero_point, information[4][4];
     int knows = (int)q->knows_zero;
-    if (q->n < 0 || q->n > MOST || q->limit < 0 || q->limit > DEEP || q->stars < 0)
-        return -1;
     for (int64_t round = 0; round <= rounds; round++) {
         double widen = round == rounds || round > 1 ? 1.0 : round == 0 ? first_gate : 0.5 * (1.0 + first_gate);
         int64_t expected = look(q, R, *f, seen);
@@ -308,7 +304,7 @@ int64_t helmstar_settle(
             if (good < 2)
                 return 0;
             if (round == rounds) {
-                fit[10] = odds, fit[11] = zero;
+                fit[10] = odds, fit[11] = zero, fit[28] = scale;
                 memcpy(fit + 12, information, sizeof information);
                 for (int64_t k = 0; k < good; k++) {
                     star[k] = seen[weighed[k].rank].star, detection[k] = weighed[k].j;
@@ -323,4 +319,43 @@ int64_t helmstar_settle(
             return -2;
     }
     return 0;
+}
+
+/* As `_typical`. */
+static double typical(const Field *q, const double *residual, const int64_t *detection, int64_t count)
+{
+    double x[DEEP];
+    for (int64_t k = 0; k < count; k++)
+        x[k] = hypot(residual[2 * k], residual[2 * k + 1]) / q->sigma[detection[k]];
+    return middle(x, count) / 1.18;
+}
+
+/* Matches and steps `rounds` times from R and f, the head of `fit`, then matches and weighs, at one scale of sigmas and from there at
+   the next ones as long as that is asked for and helps. Number of matches: star and j (limit,) are theirs, and the residuals (2 limit,)
+   after the fit's head. 0 where fewer than two stars fit or nothing speaks for it, -1 where sizes are out of range, -2 where a step has
+   no solution. */
+int64_t helmstar_settle(
+    const Field *q, int64_t scales, const double *scale, double first_gate, int64_t rounds, double *fit, int64_t *star,
+    int64_t *detection)
+{
+    double wider[HEAD + 2 * DEEP];
+    int64_t stars[DEEP], detections[DEEP];
+    if (q->n < 0 || q->n > MOST || q->limit < 0 || q->limit > DEEP || q->stars < 0 || scales < 1)
+        return -1;
+    int64_t count = at_scale(q, scale[0], first_gate, rounds, fit, star, detection);
+    for (int64_t k = 1; k < scales && count > 0; k++) {
+        if (fit[10] < 0.0 || typical(q, fit + HEAD, detection, count) < 1.25 * fit[28])
+            break;
+        memcpy(wider, fit, 10 * sizeof(double));
+        int64_t more = at_scale(q, scale[k], 1.0, 2, wider, stars, detections);
+        if (more < 0)
+            return more;
+        if (more == 0 || wider[10] <= fit[10])
+            break;
+        count = more;
+        memcpy(fit, wider, sizeof(double) * (size_t)(HEAD + 2 * count));
+        memcpy(star, stars, sizeof(int64_t) * (size_t)count);
+        memcpy(detection, detections, sizeof(int64_t) * (size_t)count);
+    }
+    return count;
 }

@@ -22,7 +22,6 @@ from __future__ import annotations
 import ctypes
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -41,8 +40,8 @@ LEAST_PROBABILITY = 1e-99
 """Below this a probability is a figure of the model, not of the world."""
 HOPELESS = -14.0
 """Log odds after the first step below which a hypothesis is dropped."""
-SCALES = (1.8, 3.2)
-"""Factors on the detections' sigmas that are tried where the residuals ask for it."""
+SCALES = (1.0, 1.8, 3.2)
+"""Factors on the detections' sigmas; all but the first are tried where the residuals ask for it."""
 GATE = 3.6
 """Residuals of matches, over sigma."""
 MOST_IN_C, DEEPEST_IN_C = 512, 398
@@ -218,18 +217,7 @@ def verify(
     limit = deepest(d)
     candidates = expected_stars(sky, level, R, f, d, limit)
     r, V = sky.directions.take(candidates, axis=0), sky.magnitude.take(candidates)
-    field = _Field(d, freedom, candidates, r, V, limit, volume)
-    best = field.settle(R, f, 1.0, first_gate, rounds)
-    # Sigmas that were told too small show in the residuals. Wider ones are tried, and kept only if they explain more: estimated
-    # from the residuals they would grow with every false match that the wider gate lets in.
-    for scale in SCALES:
-        if best is None or best.log_odds < 0.0 or _typical(best, d) < 1.25 * best.sigma_scale:
-            break
-        wider = field.settle(best.R, best.f, scale, 1.0, 2)
-        if wider is None or wider.log_odds <= best.log_odds:
-            break
-        best = wider
-    return best
+    return _Field(d, freedom, candidates, r, V, limit, volume).settle(R, f, SCALES, first_gate, rounds)
 
 
 def _typical(fit: Fit, d: Detections) -> float:
@@ -272,11 +260,26 @@ class _Field:
     limit: int
     volume: float
 
-    def settle(self, R: np.ndarray, f: float, scale: float, first_gate: float, rounds: int) -> Fit | None:
-        """Match and step `rounds` times, then match and weigh."""
+    def settle(self, R: np.ndarray, f: float, scales: tuple[float, ...], first_gate: float, rounds: int) -> Fit | None:
+        """Match and step `rounds` times, then match and weigh, at the first scale of sigmas; from there at the next ones.
+
+        Sigmas that were told too small show in the residuals. Wider ones are tried, and kept only if they explain more: estimated
+        from the residuals they would grow with every false match that the wider gate lets in.
+        """
         library = kernels()
         if library is not None and len(self.d) <= MOST_IN_C and self.limit <= DEEPEST_IN_C:
-            return self._compiled(library, R, f, scale, first_gate, rounds)
+            return self._compiled(library, R, f, scales, first_gate, rounds)
+        best = self._at_scale(R, f, scales[0], first_gate, rounds)
+        for scale in scales[1:]:
+            if best is None or best.log_odds < 0.0 or _typical(best, self.d) < 1.25 * best.sigma_scale:
+                break
+            wider = self._at_scale(best.R, best.f, scale, 1.0, 2)
+            if wider is None or wider.log_odds <= best.log_odds:
+                break
+            best = wider
+        return best
+
+    def _at_scale(self, R: np.ndarray, f: float, scale: float, first_gate: float, rounds: int) -> Fit | None:
         d, freedom, zero = self.d, self.freedom, self.d.zero_point
         for turn_number in range(rounds + 1):
             p, _ = project(self.r, R, f)
@@ -321,7 +324,6 @@ class _Field:
             f = min(max(f, 0.97 * freedom.f_low), 1.03 * freedom.f_high)
         return None
 
-    @cached_property
     def _in_c(self) -> tuple[_InC, list[np.ndarray]]:
         """For verify.c, and the arrays that it points to."""
         d, freedom, n, stars = self.d, self.freedom, len(self.d), len(self.candidates)
@@ -340,17 +342,17 @@ class _Field:
         ), arrays  # fmt: skip
 
     def _compiled(
-        self, library: ctypes.CDLL, R: np.ndarray, f: float, scale: float, first_gate: float, rounds: int
+        self, library: ctypes.CDLL, R: np.ndarray, f: float, scales: tuple[float, ...], first_gate: float, rounds: int
     ) -> Fit | None:
         """As `settle`, by verify.c."""
-        s, _ = self._in_c
-        fit, matches = np.empty(28 + 2 * self.limit), np.empty((2, self.limit), dtype=np.int64)
+        s, _kept = self._in_c()
+        fit, matches = np.empty(29 + 2 * self.limit), np.empty((2, self.limit), dtype=np.int64)
         fit[:9], fit[9], at = R.ravel(), f, address(matches)
         call = library.helmstar_settle
         call.restype = ctypes.c_int64
         count = call(
-            ctypes.byref(s), ctypes.c_double(scale), ctypes.c_double(first_gate), ctypes.c_int64(rounds),
-            ctypes.c_void_p(address(fit)), ctypes.c_void_p(at), ctypes.c_void_p(at + 8 * self.limit),
+            ctypes.byref(s), ctypes.c_int64(len(scales)), (ctypes.c_double * len(scales))(*scales), ctypes.c_double(first_gate),
+            ctypes.c_int64(rounds), ctypes.c_void_p(address(fit)), ctypes.c_void_p(at), ctypes.c_void_p(at + 8 * self.limit),
         )  # fmt: skip
         if count == -2:
             raise np.linalg.LinAlgError("a step of the fit has no solution")
@@ -360,8 +362,8 @@ class _Field:
             return None
         stars, detections = matches[:, :count]
         return Fit(
-            fit[:9].reshape(3, 3), float(fit[9]), self.candidates[stars], detections, fit[28 : 28 + 2 * count].reshape(-1, 2),
-            float(fit[10]), scale, float(fit[11]), fit[12:28].reshape(4, 4),
+            fit[:9].reshape(3, 3), float(fit[9]), self.candidates[stars], detections, fit[29 : 29 + 2 * count].reshape(-1, 2),
+            float(fit[10]), float(fit[28]), float(fit[11]), fit[12:28].reshape(4, 4),
         )  # fmt: skip
 
 
