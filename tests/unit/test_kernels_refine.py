@@ -55,12 +55,13 @@ def case(
         prior = LensPrior.calibrated(Calibrated(nominal, 0.3, 0.4, 1e-3))
     else:
         prior = getattr(LensPrior, lens)(nominal, 0.003)
-    off = np.clip(rng.normal(size=3), -1.5, 1.5)  # beyond, some of these lenses fold a corner over
-    k1 = nominal.distortion[0] + prior.k1 * off[2]
+    off = np.clip(rng.normal(size=5), -1.5, 1.5)  # beyond, some of these lenses fold a corner over
+    k1, k2, p1, p2, k3 = nominal.distortion
+    bent = (k1 + prior.k1 * off[2], k2, p1 + prior.tangential * off[3], p2 + prior.tangential * off[4], k3)
     e = prior.centre_px * off[:2] / [1.0, aspect]
     true = replace(
         nominal, focal_px=nominal.focal_px * (1.0 + rng.normal(0.0, 0.003 if lens != "calibrated" else prior.focal)),
-        centre_px=(nominal.cx + e[0], nominal.cy + e[1]), distortion=(k1, *nominal.distortion[1:]),
+        centre_px=(nominal.cx + e[0], nominal.cy + e[1]), distortion=bent,
     )  # fmt: skip
     sky, R = default_sky(), Rotation.random(rng=rng).as_matrix()
     ahead = np.flatnonzero(sky.directions @ R[2] > 0.9)
@@ -201,7 +202,7 @@ def toward(xy: list[list[float]]) -> np.ndarray:
 
 def compiled(q: last._Problem, i=None, j=None) -> last._Fit:
     every = np.arange(len(q.directions))
-    return last._compiled(kernels(), q, np.eye(3), np.zeros(4), every if i is None else i, every if j is None else j)  # type: ignore[arg-type]
+    return last._compiled(kernels(), q, np.eye(3), np.zeros(6), every if i is None else i, every if j is None else j)  # type: ignore[arg-type]
 
 
 def test_what_stars_leave_open_has_a_large_variance_and_nothing_a_negative_one():

@@ -65,7 +65,9 @@ def test_attitudes_are_off_by_what_is_said():
         data = frames(seed, px)
         fit = calibrate(data, CAMERA)
         said.append(shared_px(data, fit))
-        for m, q in zip(new := frames(100 + seed, px, 10, 60), Rotation.random(10, rng=np.random.default_rng(100 + seed))):
+        for m, q in zip(
+            new := frames(100 + seed, px, 10, 60), Rotation.random(10, rng=np.random.default_rng(100 + seed))
+        ):
             R = Rotation.from_quat(svd(fit.camera.directions(m.xy_px), m.directions_N).q_BN)
             # What is truly seen at the pixel in the middle, and what the fitted camera and attitude say.
             at = middle.copy()

@@ -29,7 +29,7 @@ class Calibrated:
     is None.
 
     centroid_scale, centroid_floor_px: the covariance of a centroid is scale^2 times the detection's, plus floor^2 on each axis.
-    smooth_px: 1 sigma per axis by which the lens moves neighbouring stars alike beyond what is fitted: more stars do not average it.
+    smooth_px: 1 sigma per axis by which the lens moves neighbouring stars alike beyond the fit, which more stars do not average.
     dark: (height, width) float32 to subtract, or None.
     """
 

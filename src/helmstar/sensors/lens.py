@@ -15,36 +15,53 @@ from ..imaging import Camera
 from ..imaging.calibrate import Calibration, derivative
 from ..imaging.calibrated import Calibrated
 
+PARAMETERS = 9
+"""Of the fit: a turn theta, ln f, e_x, e_y, and what k1, p1 and p2 differ from the camera's."""
+
 
 @dataclass(frozen=True)
 class LensPrior:
-    """1 sigma of what the lens may differ from the camera: focal (relative; infinite: unknown), centre_px, and k1."""
+    """1 sigma of what the lens may differ from the camera: focal (relative; infinite: unknown), centre_px, k1, and p1 and p2."""
 
     focal: float
     centre_px: float
     k1: float
+    tangential: float = 0.0
 
     @classmethod
     def uncalibrated(cls, camera: Camera, focal: float) -> LensPrior:
-        """Of an unknown lens: centred within 2% of the image's width, and 1% of distortion in the corner."""
-        corner = 0.5 * math.hypot(camera.width, camera.height * camera.aspect) / camera.focal_px
-        return cls(focal, 0.02 * camera.width, 0.01 / corner**2)
+        """Of an unknown lens: centred within 2% of the image's width, 1% of distortion in the corner, and 0.03% of tangential
+        distortion there."""
+        corner = _corner(camera)
+        return cls(focal, 0.02 * camera.width, 0.01 / corner**2, 0.0003 / (3.0 * corner))
 
     @classmethod
     def rough(cls, camera: Camera, focal: float) -> LensPrior:
-        """Of a lens that displaces stars by pixels: a decentred one, centred within 10%, and 3% of distortion in the corner."""
-        usual = cls.uncalibrated(camera, focal)
-        return cls(focal, 5.0 * usual.centre_px, 3.0 * usual.k1)
+        """Of a lens that displaces stars by pixels: centred within 10%, 3% of distortion in the corner, and 0.3% of tangential
+        distortion. What else it does is a smooth field (`displaced`)."""
+        corner = _corner(camera)
+        return cls(focal, 0.1 * camera.width, 0.03 / corner**2, 0.003 / (3.0 * corner))
 
     @classmethod
     def calibrated(cls, known: Calibrated) -> LensPrior:
         """As the calibration says; a camera written by hand is believed to 0.05% of its focal length, 0.2% of its width, and 0.1%
-        of distortion in the corner. A focal length follows the temperature: never better than 0.01%."""
+        of distortion and 0.01% of tangential distortion in the corner. A focal length follows the temperature: never better than
+        0.01%."""
         camera = known.camera
-        corner = 0.5 * math.hypot(camera.width, camera.height * camera.aspect) / camera.focal_px
         focal = 5e-4 if known.focal_sigma_px is None else math.hypot(known.focal_sigma_px / camera.focal_px, 1e-4)
         centre = 0.002 * camera.width if known.centre_sigma_px is None else known.centre_sigma_px
-        return cls(focal, centre, 0.001 / corner**2 if known.k1_sigma is None else known.k1_sigma)
+        if known.k1_sigma is None:
+            return cls(focal, centre, 0.001 / _corner(camera) ** 2, 0.0001 / (3.0 * _corner(camera)))
+        return cls(focal, centre, known.k1_sigma)
+
+
+def _corner(camera: Camera) -> float:
+    """Tangent of the corner's angle from the middle."""
+    return 0.5 * math.hypot(camera.width, camera.height * camera.aspect) / camera.focal_px
+
+
+_PROJECTED = 7
+"""Of these, those that a calibration's covariance is told by: the turn, ln f, e_x, e_y and k1."""
 
 
 def lens_sigmas(fit: Calibration) -> tuple[float, float, float, float]:
@@ -58,8 +75,8 @@ def lens_sigmas(fit: Calibration) -> tuple[float, float, float, float]:
     grid = np.stack(np.meshgrid(np.linspace(0.05, 0.95, 8), np.linspace(0.05, 0.95, 8)), axis=-1).reshape(-1, 2)
     d = camera.directions(grid * [camera.width, camera.height])
     d = d[np.isfinite(d).all(axis=1)]
-    _, J = Lens.of(camera, LensPrior.uncalibrated(camera, 1.0)).predict(np.eye(3), np.zeros(4), d)
-    J = J.reshape(-1, 7)
+    _, J = Lens.of(camera, LensPrior.uncalibrated(camera, 1.0)).predict(np.eye(3), np.zeros(6), d)
+    J = J[:, :, :_PROJECTED].reshape(-1, _PROJECTED)
     open_ = derivative(camera, names, d).reshape(-1, len(names))
     scale = np.linalg.norm(J, axis=0)
     A = np.linalg.lstsq(J / scale, open_, rcond=1e-6)[0] / scale[:, None]
@@ -71,7 +88,7 @@ def lens_sigmas(fit: Calibration) -> tuple[float, float, float, float]:
 
 @dataclass(frozen=True)
 class Lens:
-    """The camera, the information (7,) of the priors on theta (none), ln f, e_x, e_y, k1, and round (2, 2): a round
+    """The camera, the information (9,) of the priors on theta (none), ln f, e_x, e_y, k1, p1, p2, and round (2, 2): a round
     uncertainty of the sky in the image's pixels."""
 
     camera: Camera
@@ -80,16 +97,17 @@ class Lens:
 
     @classmethod
     def of(cls, camera: Camera, prior: LensPrior) -> Lens:
-        sigma = (prior.focal, prior.centre_px, prior.centre_px / camera.aspect, prior.k1)
+        tangential = prior.tangential, prior.tangential
+        sigma = (prior.focal, prior.centre_px, prior.centre_px / camera.aspect, prior.k1, *tangential)
         known = np.array([0.0, 0.0, 0.0, *(1.0 / max(s, 1e-9) ** 2 for s in sigma)])
         return cls(camera, known, np.array([[1.0, 0.0], [0.0, camera.aspect**-2]]))
 
     def predict(self, R: np.ndarray, p: np.ndarray, d_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (n, 2) of directions, and their derivative (n, 2, 7) by theta, ln f, e_x, e_y, k1."""
+        """Pixels (n, 2) of directions, and their derivative (n, 2, 9) by theta and p (6,) = ln f, e_x, e_y, k1, p1, p2."""
         c = self.camera
         a, f, (ex, ey) = c.aspect, c.focal_px * np.exp(p[0]), p[1:3]
         k1, k2, p1, p2, k3 = c.distortion
-        k1 = k1 + p[3]
+        k1, p1, p2 = k1 + p[3], p1 + p[4], p2 + p[5]
         # Where the lens itself sees the stated centre: a turn takes z of S there.
         sx, sy = -ex / f, -a * ey / f
         r2 = sx * sx + sy * sy
@@ -109,7 +127,7 @@ class Lens:
         cross = h * x * y + 2.0 * p1 * x + 2.0 * p2 * y
         dxx = g + h * x * x + 2.0 * p1 * y + 6.0 * p2 * x
         dyy = g + h * y * y + 6.0 * p1 * y + 2.0 * p2 * x
-        J = np.empty((len(x), 2, 7))
+        J = np.empty((len(x), 2, PARAMETERS))
         for k in range(3):
             J[:, 0, k] = f * (dxx * turn_x[k] + cross * turn_y[k])
             J[:, 1, k] = f / a * (cross * turn_x[k] + dyy * turn_y[k])
@@ -119,16 +137,18 @@ class Lens:
         J[:, :, 5] = [0.0, 1.0] + a * J[:, :, 0] / f
         J[:, :, :3] = (J[:, :, :3].reshape(-1, 3) @ T).reshape(-1, 2, 3)
         J[:, 0, 6], J[:, 1, 6] = f * x * r2, f / a * y * r2
+        J[:, 0, 7], J[:, 1, 7] = 2.0 * f * xy, f / a * (r2 + 2.0 * y * y)
+        J[:, 0, 8], J[:, 1, 8] = f * (r2 + 2.0 * x * x), 2.0 * f / a * xy
         return np.stack([c.cx + ex + f * xd, c.cy + ey + f / a * yd], axis=1), J
 
     def second_order(self, delta: np.ndarray) -> float:
-        """Bound, px, on what a step (7,) leaves: products of turns, of the focal length's and of the centre's share."""
+        """Bound, px, on what a step (9,) leaves: products of turns, of the focal length's and of the centre's share."""
         f = self.camera.focal_px
         turned, centre = float(np.abs(delta[:3]).sum()), float(np.abs(delta[4:6]).sum())
         return f * (turned + abs(float(delta[3])) + centre / f) ** 2
 
     def prior(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Information (7,) of what is known before, and its gradient (7,) at p."""
+        """Information (9,) of what is known before, and its gradient (9,) at p."""
         return self.known, -self.known * np.concatenate([np.zeros(3), p])
 
 

@@ -10,20 +10,21 @@
 #include "../native.h"
 
 #define TINY 1e-13 /* information, in units in which it is about one, that everything has */
-#define ROW 8      /* 7 parameters and a zero, so that rows are whole vectors */
+#define PARAMETERS 9
+#define ROW 12     /* the parameters and zeros, so that rows are whole vectors */
 
 /* How many stars (n) and detections (m), the camera, what is known of the lens before, and the constants of refine.py. */
 typedef struct {
     int64_t n, m, least, steps, matchings;
-    double aspect, focal, cx, cy, distortion[5], known[7];
+    double aspect, focal, cx, cy, distortion[5], known[PARAMETERS];
     double zero, magnitude_gate, density, gate, huber, degrees, still, bent;
     const double *directions, *V, *drift;      /* (n, 3), (n,), (n,): these and the next are not the caller's to say */
     const double *xy, *covariance, *magnitude; /* (m, 2), (m, 2, 2), (m,) */
 } Problem;
 
-/* As in refine.py: R (3, 3), p of ln f, e_x, e_y, k1, and the last step with its covariance and scale. */
+/* As in refine.py: R (3, 3), p of ln f, e_x, e_y, k1, p1, p2, and the last step with its covariance and scale. */
 typedef struct {
-    double R[9], p[4], delta[7], covariance[49], scale;
+    double R[9], p[6], delta[PARAMETERS], covariance[PARAMETERS * PARAMETERS], scale;
 } Fit;
 
 /* A detection's place in the order of x, its variance and what it is compared by. */
@@ -88,7 +89,8 @@ static void product(const double *A, const double *B, double *out)
 FAST static void predict(const Problem *q, const Fit *fit, Room *room)
 {
     double a = q->aspect, f = q->focal * exp(fit->p[0]), fa = f / a, ex = fit->p[1], ey = fit->p[2];
-    double k1 = q->distortion[0] + fit->p[3], k2 = q->distortion[1], p1 = q->distortion[2], p2 = q->distortion[3];
+    double k1 = q->distortion[0] + fit->p[3], k2 = q->distortion[1];
+    double p1 = q->distortion[2] + fit->p[4], p2 = q->distortion[3] + fit->p[5];
     double k3 = q->distortion[4], sx = -ex / f, sy = -a * ey / f, square = sx * sx + sy * sy, T[9], M[9];
     sx = sx / (1.0 + k1 * square), sy = sy / (1.0 + k1 * square);
     turn_to(sx, sy, T);
@@ -115,7 +117,10 @@ FAST static void predict(const Problem *q, const Fit *fit, Room *room)
         Ju[4] = 1.0 - u[1] / f, Jv[4] = -v[1] / f;
         Ju[5] = a * u[0] / f, Jv[5] = 1.0 + a * v[0] / f;
         Ju[6] = f * x * r2, Jv[6] = fa * y * r2;
-        Ju[7] = Jv[7] = 0.0;
+        Ju[7] = 2.0 * f * xy, Jv[7] = fa * (r2 + 2.0 * y * y);
+        Ju[8] = f * (r2 + 2.0 * x * x), Jv[8] = 2.0 * fa * xy;
+        for (int c = PARAMETERS; c < ROW; c++)
+            Ju[c] = Jv[c] = 0.0;
         room->predicted[2 * i] = q->cx + ex + f * xd, room->predicted[2 * i + 1] = q->cy + ey + fa * yd;
     }
 }
@@ -124,39 +129,39 @@ FAST static void predict(const Problem *q, const Fit *fit, Room *room)
 static inline __attribute__((always_inline)) double moved(const double *J, const Fit *fit)
 {
     double sum = 0.0;
-    for (int c = 0; c < 7; c++)
+    for (int c = 0; c < PARAMETERS; c++)
         sum += J[c] * fit->delta[c];
     return sum;
 }
 
-/* Inverse of the symmetric A (7, 7) of which the lower half is given, by Cholesky's factor. A pivot below TINY, which only rounding
+/* Inverse of the symmetric A (9, 9) of which the lower half is given, by Cholesky's factor. A pivot below TINY, which only rounding
    leaves, is TINY: what nothing fixes is uncertain by that much, and the inverse has no negative variance. */
-static void invert(double A[7][7], double *out)
+static void invert(double A[PARAMETERS][PARAMETERS], double *out)
 {
-    double B[7][7] = {{0.0}}; /* of the factor, by rows */
-    for (int c = 0; c < 7; c++) {
+    double B[PARAMETERS][PARAMETERS] = {{0.0}}; /* of the factor, by rows */
+    for (int c = 0; c < PARAMETERS; c++) {
         for (int k = 0; k < c; k++)
             A[c][c] -= A[c][k] * A[c][k];
         A[c][c] = sqrt(A[c][c] < TINY ? TINY : A[c][c]);
-        for (int r = c + 1; r < 7; r++) {
+        for (int r = c + 1; r < PARAMETERS; r++) {
             for (int k = 0; k < c; k++)
                 A[r][c] -= A[r][k] * A[c][k];
             A[r][c] /= A[c][c];
         }
     }
-    for (int c = 0; c < 7; c++)
-        for (int r = c; r < 7; r++) {
+    for (int c = 0; c < PARAMETERS; c++)
+        for (int r = c; r < PARAMETERS; r++) {
             double sum = r == c;
             for (int k = c; k < r; k++)
                 sum -= A[r][k] * B[k][c];
             B[r][c] = sum / A[r][r];
         }
-    for (int r = 0; r < 7; r++)
+    for (int r = 0; r < PARAMETERS; r++)
         for (int c = 0; c <= r; c++) {
             double sum = 0.0;
-            for (int k = r; k < 7; k++)
+            for (int k = r; k < PARAMETERS; k++)
                 sum += B[k][r] * B[k][c];
-            out[7 * r + c] = out[7 * c + r] = sum;
+            out[PARAMETERS * r + c] = out[PARAMETERS * c + r] = sum;
         }
 }
 
@@ -164,18 +169,18 @@ static void invert(double A[7][7], double *out)
 FAST static void settle(
     const Problem *q, const Room *room, Fit *fit, const int64_t *i, const int64_t *j, int64_t count, int rounds)
 {
-    double size[7], *P = fit->covariance, *delta = fit->delta, other = 1.0 / (q->aspect * q->aspect);
-    for (int c = 0; c < 7; c++)
+    double size[PARAMETERS], *P = fit->covariance, *delta = fit->delta, other = 1.0 / (q->aspect * q->aspect);
+    for (int c = 0; c < PARAMETERS; c++)
         size[c] = q->known[c];
     for (int64_t k = 0; k < count; k++) {
         const double *Ju = room->J + 2 * ROW * i[k], *Jv = Ju + ROW;
-        for (int c = 0; c < 7; c++)
+        for (int c = 0; c < PARAMETERS; c++)
             size[c] += Ju[c] * Ju[c] + Jv[c] * Jv[c];
     }
-    for (int c = 0; c < 7; c++)
+    for (int c = 0; c < PARAMETERS; c++)
         size[c] = 1.0 / sqrt(size[c]);
     for (int round = 0; round < rounds; round++) {
-        double N[7][ROW] = {{0.0}}, g[ROW] = {0.0}, S[7][7], weights = 0.0, squares = 0.0, seen = 7.0;
+        double N[PARAMETERS][ROW] = {{0.0}}, g[ROW] = {0.0}, S[PARAMETERS][PARAMETERS], weights = 0.0, squares = 0.0, seen = PARAMETERS;
         for (int64_t k = 0; k < count; k++) {
             const double *Ju = room->J + 2 * ROW * i[k], *Jv = Ju + ROW, *C = q->covariance + 4 * j[k];
             double drift = q->drift[i[k]] * q->drift[i[k]], c00 = C[0] + drift, c11 = C[3] + drift * other;
@@ -191,28 +196,28 @@ FAST static void settle(
                 a[c] = weight * (w00 * Ju[c] + w01 * Jv[c]), b[c] = weight * (w01 * Ju[c] + w11 * Jv[c]);
                 g[c] += a[c] * tx + b[c] * ty;
             }
-            for (int r = 0; r < 7; r++)
+            for (int r = 0; r < PARAMETERS; r++)
                 for (int c = 0; c < ROW; c++)
                     N[r][c] += Ju[r] * a[c] + Jv[r] * b[c];
         }
-        for (int c = 0; c < 7; c++)
-            seen -= P[8 * c] * q->known[c]; /* parameters that the stars fix, not the priors */
+        for (int c = 0; c < PARAMETERS; c++)
+            seen -= P[(PARAMETERS + 1) * c] * q->known[c]; /* parameters that the stars fix, not the priors */
         double freedom = 2.0 * weights - seen;
         fit->scale = sqrt((q->degrees + squares) / (q->degrees + (freedom > 0.0 ? freedom : 0.0)));
         double share = 1.0 / (fit->scale * fit->scale);
-        for (int r = 0; r < 7; r++)
+        for (int r = 0; r < PARAMETERS; r++)
             for (int c = 0; c <= r; c++)
                 S[r][c] = (N[r][c] * share + (r == c ? q->known[c] : 0.0)) * (size[r] * size[c]) + (r == c ? TINY : 0.0);
         invert(S, P);
-        for (int r = 0; r < 7; r++)
-            for (int c = 0; c < 7; c++)
-                P[7 * r + c] *= size[r] * size[c];
-        for (int c = 0; c < 7; c++)
+        for (int r = 0; r < PARAMETERS; r++)
+            for (int c = 0; c < PARAMETERS; c++)
+                P[PARAMETERS * r + c] *= size[r] * size[c];
+        for (int c = 0; c < PARAMETERS; c++)
             g[c] = g[c] * share - (c < 3 ? 0.0 : q->known[c] * fit->p[c - 3]);
-        for (int r = 0; r < 7; r++) {
+        for (int r = 0; r < PARAMETERS; r++) {
             delta[r] = 0.0;
-            for (int c = 0; c < 7; c++)
-                delta[r] += P[7 * r + c] * g[c];
+            for (int c = 0; c < PARAMETERS; c++)
+                delta[r] += P[PARAMETERS * r + c] * g[c];
         }
     }
 }
@@ -236,12 +241,10 @@ static int64_t depth(const Problem *q, const Room *room, int64_t count)
 /* As `_matched`, with the matches in the room; the number of them. A place that is no number matches nothing. */
 FAST static int64_t match(const Problem *q, const Fit *fit, Room *room)
 {
-    double P[7][ROW], most = 0.0, far = q->gate * q->gate;
+    double P[PARAMETERS][ROW] = {{0.0}}, most = 0.0, far = q->gate * q->gate;
     int64_t count = 0;
-    for (int r = 0; r < 7; r++) {
-        memcpy(P[r], fit->covariance + 7 * r, 7 * sizeof(double));
-        P[r][7] = 0.0;
-    }
+    for (int r = 0; r < PARAMETERS; r++)
+        memcpy(P[r], fit->covariance + PARAMETERS * r, PARAMETERS * sizeof(double));
     for (int64_t j = 0; j < q->m; j++) {
         room->sigma2[j] = fit->scale * fit->scale * 0.5 * (q->covariance[4 * j] + q->covariance[4 * j + 3]);
         most = room->sigma2[j] > most ? room->sigma2[j] : most;
@@ -252,10 +255,10 @@ FAST static int64_t match(const Problem *q, const Fit *fit, Room *room)
     for (int64_t i = 0; i < q->n; i++) {
         const double *Ju = room->J + 2 * ROW * i, *Jv = Ju + ROW;
         double u[ROW] = {0.0}, v[ROW] = {0.0}, sum = 0.0;
-        for (int r = 0; r < 7; r++)
+        for (int r = 0; r < PARAMETERS; r++)
             for (int c = 0; c < ROW; c++)
                 u[c] += Ju[r] * P[r][c], v[c] += Jv[r] * P[r][c];
-        for (int c = 0; c < 7; c++)
+        for (int c = 0; c < PARAMETERS; c++)
             sum += u[c] * Ju[c] + v[c] * Jv[c];
         double doubt2 = 0.5 * sum + q->drift[i] * q->drift[i], reach = sqrt(far * (most + doubt2)) * (1.0 + 1e-12);
         double x = room->predicted[2 * i] + moved(Ju, fit), y = room->predicted[2 * i + 1] + moved(Jv, fit);
@@ -314,8 +317,8 @@ static int64_t fitted(const Problem *q, Fit *fit, Room *room, int64_t count, int
         room->factorial[k] = room->factorial[k - 1] + log((double)k);
     sort_by_x(q, room);
     memset(fit->covariance, 0, sizeof fit->covariance);
-    for (int c = 0; c < 7; c++)
-        fit->covariance[8 * c] = q->known[c] > 0.0 ? 1.0 / (q->known[c] > 1e-300 ? q->known[c] : 1e-300) : 0.0;
+    for (int c = 0; c < PARAMETERS; c++)
+        fit->covariance[(PARAMETERS + 1) * c] = q->known[c] > 0.0 ? 1.0 / (q->known[c] > 1e-300 ? q->known[c] : 1e-300) : 0.0;
     fit->scale = 1.0;
     for (int64_t step = 0; step < q->steps; step++) {
         predict(q, fit, room);
@@ -335,7 +338,7 @@ static int64_t fitted(const Problem *q, Fit *fit, Room *room, int64_t count, int
             settle(q, room, fit, i, j, count, 2);
         }
         turn(fit->delta, fit->R);
-        for (int c = 0; c < 4; c++)
+        for (int c = 0; c < 6; c++)
             fit->p[c] += fit->delta[3 + c];
         int still = 1;
         for (int64_t k = 0; k < 2 * count; k++) {

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from ..stars.identify import Identification, matrix_of_quaternion
 from ..stars.patterns import Sky
 from ..stars.problem import middle
 from ..stars.verify import turn
-from .lens import Lens, LensPrior
+from .lens import PARAMETERS, Lens, LensPrior
 
 EPOCH_SPREAD_YEARS = 25.0
 """Proper motion counts as this many years of uncertainty where the time of an image is not told."""
@@ -52,19 +52,21 @@ ASTRAY = 2.0
 _STEPS = 4
 _MATCHINGS = 2
 _LEAST = 3
+_FIT = 106
 _ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])
 
 
 @dataclass(frozen=True)
 class Refined:
-    """identification: with the attitude, covariance, matches and residuals of the fit. camera: with the fit's focal length and
-    k1. scale: factor on the sigmas of the matched stars that their residuals show; the covariance holds it. strain:
-    the largest of what the fit found of centre and k1, over the prior's sigma."""
+    """identification: with the attitude, covariance, matches and residuals of the fit. camera: with the fit's focal length, k1,
+    p1 and p2. scale: factor on the sigmas of the matched stars that their residuals show; the covariance holds it. strain:
+    the largest of what the fit found of centre, k1, p1 and p2, over the prior's sigma. lens: (6,) p of `Lens.predict`."""
 
     identification: Identification
     camera: Camera
     scale: float
     strain: float = 0.0
+    lens: np.ndarray = field(default_factory=lambda: np.zeros(PARAMETERS - 3))
 
 
 def refine(
@@ -93,30 +95,39 @@ def refine(
         Lens.of(camera, prior), d_N, V, drift, centroids.xy_px, centroids.covariance_px, magnitude, zero, magnitude_gate,
         density,
     )  # fmt: skip
-    p, library = np.array([np.log(found.focal_px / camera.focal_px), 0.0, 0.0, 0.0]), kernels()
+    p, library = np.array([np.log(found.focal_px / camera.focal_px), 0.0, 0.0, 0.0, 0.0, 0.0]), kernels()
     fit = _fit(problem, R, p, i, j) if library is None else _compiled(library, problem, R, p, i, j)
     if not abs(fit.p[0] - p[0]) < math.log(ASTRAY):  # nor where it is no number
         return Refined(found, replace(camera, focal_px=found.focal_px), 1.0)
     order = np.argsort(fit.j, kind="stable")
     i, j, residual = near[fit.i[order]], fit.j[order], fit.residual[order] * [1.0, camera.aspect]
     focal = camera.focal_px * float(np.exp(fit.p[0]))
-    q_SN, z = quaternion_of(fit.R), fit.R[2]
-    mounted = found.q_BN is not found.q_SN
-    R_BS = matrix_of_quaternion(found.q_BN) @ R.T if mounted else None
     better = replace(
-        found, q_SN=q_SN, q_BN=q_SN if R_BS is None else quaternion_of(R_BS @ fit.R),
-        covariance=fit.covariance[:3, :3], stars=i, detections=j, hip=sky.catalog.hip[i], residuals_px=residual,
+        turned(found, fit.R, fit.covariance[:3, :3]), stars=i, detections=j, hip=sky.catalog.hip[i], residuals_px=residual,
         focal_px=focal, residual_rms=math.sqrt(float(np.square(residual).mean())) / focal,
-        ra=math.atan2(z[1], z[0]) % (2.0 * math.pi), dec=math.asin(max(-1.0, min(1.0, z[2]))),
-        roll=math.atan2(-fit.R[0, 2], -fit.R[1, 2]) % (2.0 * math.pi),
     )  # fmt: skip
     strain = float(np.sqrt(np.max(fit.p[1:] ** 2 * problem.lens.known[4:])))
-    return Refined(better, _with(camera, focal, float(fit.p[3])), fit.scale, strain)
+    return Refined(better, _with(camera, focal, *fit.p[3:].tolist()), fit.scale, strain, fit.p)
 
 
-def _with(camera: Camera, focal_px: float, k1: float) -> Camera:
-    """The camera of another focal length, and k1 added to its own: what of it folds no corner over, where no star was seen."""
-    for distortion in ((camera.distortion[0] + k1, *camera.distortion[1:]), camera.distortion):
+def turned(found: Identification, R_SN: np.ndarray, covariance: np.ndarray) -> Identification:
+    """With another attitude R_SN (3, 3) of the sensor, and its covariance (3, 3)."""
+    q_SN, z = quaternion_of(R_SN), R_SN[2]
+    q_BN = q_SN
+    if found.q_BN is not found.q_SN:
+        R_BS = matrix_of_quaternion(found.q_BN) @ matrix_of_quaternion(found.q_SN).T
+        q_BN = quaternion_of(R_BS @ R_SN)
+    return replace(
+        found, q_SN=q_SN, q_BN=q_BN, covariance=covariance, ra=math.atan2(z[1], z[0]) % (2.0 * math.pi),
+        dec=math.asin(max(-1.0, min(1.0, z[2]))), roll=math.atan2(-R_SN[0, 2], -R_SN[1, 2]) % (2.0 * math.pi),
+    )  # fmt: skip
+
+
+def _with(camera: Camera, focal_px: float, k1: float, p1: float, p2: float) -> Camera:
+    """The camera of another focal length, and k1, p1, p2 added to its own: what of it folds no corner over, where no star was
+    seen."""
+    own = camera.distortion
+    for distortion in ((own[0] + k1, own[1], own[2] + p1, own[3] + p2, own[4]), own):
         try:
             return replace(camera, focal_px=focal_px, distortion=distortion)
         except ValueError:
@@ -158,7 +169,7 @@ class _Problem:
 
 @dataclass(frozen=True)
 class _Fit:
-    """R (3, 3) and p (4,), the covariance (7, 7) of both, the scale, and the matches i, j (k,) with their residuals (k, 2), px."""
+    """R (3, 3) and p (6,), the covariance (9, 9) of both, the scale, and the matches i, j (k,) with their residuals (k, 2), px."""
 
     R: np.ndarray
     p: np.ndarray
@@ -177,7 +188,7 @@ def _fit(q: _Problem, R: np.ndarray, p: np.ndarray, i: np.ndarray, j: np.ndarray
     residual = np.zeros((0, 2))
     for _ in range(_STEPS):
         predicted, J = lens.predict(R, p, q.directions)
-        best = None if best is None else replace(best, delta=np.zeros(7))
+        best = None if best is None else replace(best, delta=np.zeros(PARAMETERS))
         best = _settle(J[i], xy[j] - predicted[i], spread(i, j), lens.prior(p), 2 if best is None else 1, best)
         for _ in range(_MATCHINGS):
             k, m, gain = _matched(predicted + best.moved(J), J, best, xy, C, drift, agree, q.density)
@@ -204,7 +215,7 @@ class _InC(ctypes.Structure):
     _fields_ = (
         [(k, ctypes.c_int64) for k in ("n", "m", "least", "steps", "matchings")]
         + [(k, ctypes.c_double) for k in ("aspect", "focal", "cx", "cy")]
-        + [("distortion", ctypes.c_double * 5), ("known", ctypes.c_double * 7)]
+        + [("distortion", ctypes.c_double * 5), ("known", ctypes.c_double * PARAMETERS)]
         + [(k, ctypes.c_double) for k in ("zero", "magnitude_gate", "density", "gate", "huber", "degrees", "still", "bent")]
         + [(k, ctypes.c_void_p) for k in ("directions", "V", "drift", "xy", "covariance", "magnitude")]
     )  # fmt: skip
@@ -223,9 +234,9 @@ def _compiled(library: ctypes.CDLL, q: _Problem, R: np.ndarray, p: np.ndarray, i
     )  # fmt: skip
     # One array in and two out, which refine.c divides as here: an array's address takes Python as long as ten stars take C.
     given, room = np.concatenate([x.ravel() for x in arrays], dtype=float), max(n, len(i))
-    matches, fit = np.empty((2, room), dtype=np.int64), np.empty(70 + 2 * room)
+    matches, fit = np.empty((2, room), dtype=np.int64), np.empty(_FIT + 2 * room)
     matches[0, : len(i)], matches[1, : len(i)] = i, j
-    fit[:9], fit[9:13] = R.ravel(), p
+    fit[:9], fit[9:15] = R.ravel(), p
     call = library.helmstar_refine
     call.restype = ctypes.c_int64
     pointers = [ctypes.c_void_p(address(x)) for x in (given, fit, matches)]
@@ -235,22 +246,22 @@ def _compiled(library: ctypes.CDLL, q: _Problem, R: np.ndarray, p: np.ndarray, i
     if count < 0:
         raise IndexError("a match is of a detection that is not in the list")
     return _Fit(
-        fit[:9].reshape(3, 3), fit[9:13], fit[20:69].reshape(7, 7), float(fit[69]), matches[0, :count], matches[1, :count],
-        fit[70 : 70 + 2 * count].reshape(-1, 2),
+        fit[:9].reshape(3, 3), fit[9:15], fit[24:105].reshape(9, 9), float(fit[105]), matches[0, :count], matches[1, :count],
+        fit[_FIT : _FIT + 2 * count].reshape(-1, 2),
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _Settled:
-    """Step (7,) of the parameters, their covariance (7, 7), and the scale of the residuals."""
+    """Step (9,) of the parameters, their covariance (9, 9), and the scale of the residuals."""
 
     delta: np.ndarray
     covariance: np.ndarray
     scale: float
 
     def moved(self, J: np.ndarray) -> np.ndarray:
-        """By how much pixels of that derivative (n, 2, 7) move, (n, 2)."""
-        return (J.reshape(-1, 7) @ self.delta).reshape(-1, 2)
+        """By how much pixels of that derivative (n, 2, 9) move, (n, 2)."""
+        return (J.reshape(-1, PARAMETERS) @ self.delta).reshape(-1, 2)
 
 
 def _settle(
@@ -262,23 +273,25 @@ def _settle(
     known, pull = prior
     det = covariance[:, 0, 0] * covariance[:, 1, 1] - covariance[:, 0, 1] ** 2
     W = covariance[:, ::-1, ::-1] * _ADJUGATE / det[:, None, None]
-    A = J.reshape(-1, 7)
+    A = J.reshape(-1, PARAMETERS)
     # Inverted in units in which the information is about one: priors span many orders.
     size = 1.0 / np.sqrt((A * A).sum(axis=0) + known)
     WJ = W[:, :, :1] * J[:, None, 0] + W[:, :, 1:] * J[:, None, 1]
-    k, target = np.arange(7), residual.ravel()
+    k, target = np.arange(PARAMETERS), residual.ravel()
     if start is None:
-        start = _Settled(np.zeros(7), np.diag(np.where(known > 0.0, 1.0 / np.maximum(known, 1e-300), 0.0)), 1.0)
+        start = _Settled(
+            np.zeros(PARAMETERS), np.diag(np.where(known > 0.0, 1.0 / np.maximum(known, 1e-300), 0.0)), 1.0
+        )
     delta, P, scale = start.delta, start.covariance, start.scale
-    units, tiny = size * size[:, None], 1e-13 * np.eye(7)
+    units, tiny = size * size[:, None], 1e-13 * np.eye(PARAMETERS)
     for _ in range(rounds):
         rx, ry = (target - A @ delta).reshape(-1, 2).T
         square = np.maximum(W[:, 0, 0] * rx * rx + 2.0 * W[:, 0, 1] * rx * ry + W[:, 1, 1] * ry * ry, 1e-12)
         weight = np.minimum(1.0, HUBER * scale / np.sqrt(square))
-        seen = 7.0 - float(P[k, k] @ known)  # parameters that the stars fix, not the priors
+        seen = PARAMETERS - float(P[k, k] @ known)  # parameters that the stars fix, not the priors
         free = max(2.0 * float(weight.sum()) - seen, 0.0)
         scale = float(np.sqrt((SCALE_DEGREES + weight @ square) / (SCALE_DEGREES + free)))
-        weighted = (WJ * (weight / scale**2)[:, None, None]).reshape(-1, 7)
+        weighted = (WJ * (weight / scale**2)[:, None, None]).reshape(-1, PARAMETERS)
         N = A.T @ weighted
         N[k, k] += known
         P = np.linalg.inv(N * units + tiny) * units
@@ -298,7 +311,7 @@ def _matched(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stars and detections (k,), (k,) that are each other's nearest within the gate and agree (stars, detections), brightest
     star first, and the log (k,) of how much likelier each is so than by chance. density: 1/px^2, of detections."""
-    A = J.reshape(-1, 7)
+    A = J.reshape(-1, PARAMETERS)
     sigma2 = fit.scale**2 * 0.5 * (C[:, 0, 0] + C[:, 1, 1])
     doubt2 = 0.5 * ((A @ fit.covariance) * A).sum(axis=1).reshape(-1, 2).sum(axis=1) + drift**2
     apart = (predicted[:, :1] - xy[:, 0]) ** 2 + (predicted[:, 1:] - xy[:, 1]) ** 2
@@ -327,4 +340,4 @@ def _depth(gain: np.ndarray, rank: np.ndarray, count: int) -> int:
     return int(total.argmax()) + 1
 
 
-__all__ = ["EPOCH_SPREAD_YEARS", "Refined", "refine"]
+__all__ = ["EPOCH_SPREAD_YEARS", "Refined", "refine", "turned"]

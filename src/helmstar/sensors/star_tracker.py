@@ -29,6 +29,7 @@ from ..stars.identify import LIMIT, Identification, identify, matrix_of_quaterni
 from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
 from ..stars.track import WIDEST_PX, track
+from .displaced import displaced
 from .lens import LensPrior
 from .refine import EPOCH_SPREAD_YEARS, Refined, refine
 
@@ -44,8 +45,6 @@ BRIGHTEST, BRIGHT_SHARE = 12, 0.75
 """Of so many detections, the brightest, a fit that is beyond doubt explains this share."""
 BELIEF = 2.0
 """Coordinates that what is believed of a rough lens is worth."""
-SMOOTH_SHARE = 0.25
-"""Of a rough lens's displacement, what is common to all stars and is taken for attitude."""
 TRACKED = 50
 """Stars whose windows are looked at in tracking."""
 AU_DAY = 149597870700.0 / 86400.0
@@ -274,7 +273,7 @@ class StarTracker:
             few = first.scale < ROUGH_SCALE and first.strain < ROUGH_STRAIN and more < 1.4 * told + 1
             if few or rough.identification is found:
                 return first, doubt
-        return _smooth(rough, SMOOTH_SHARE * floor, camera), "rough" if doubt != "field" else "rough, field"
+        return displaced(rough, centroids, camera, self.sky, lens), "rough" if doubt != "field" else "rough, field"
 
     def _honest(self, centroids: Centroids) -> Centroids:
         """With the covariances that the calibration found."""

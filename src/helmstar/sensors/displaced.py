@@ -1,0 +1,114 @@
+"""Attitude by a lens that displaces stars as no model of a lens says: what neighbours share is a smooth field, and is estimated.
+
+The residuals of a fit of attitude and lens (`refine`) are taken as noise, of the centroids and of w beyond, and a smooth random
+field on each axis of the image, with Matern's covariance of order 5/2, A^2 (1 + a + a^2/3) exp(-a), a = sqrt(5) d/L, at a distance
+d (universal kriging: Cressie, Statistics for Spatial Data, 1993, section 3.4; the trend is the linearised fit, with its priors).
+A and w are averaged over, by their likelihood and a prior that expects A at `EXPECTED` of the width. The direction of S's z axis is
+what is seen at the stated centre, so the field there belongs to the attitude; roll is that of the fit to the whole image.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from ..imaging import Camera, Centroids
+from ..stars.identify import matrix_of_quaternion
+from ..stars.patterns import Sky
+from ..stars.verify import turn
+from .lens import Lens, LensPrior
+from .refine import HUBER, Refined, turned
+
+EXPECTED = 0.0015
+"""Of the image's width: the field's amplitude A above which it is less and less expected."""
+AMPLITUDES = np.geomspace(0.0001, 0.0064, 7)
+NOISES = np.geomspace(0.00002, 0.00256, 8)
+"""A and w that are tried, over the image's width."""
+REACH = 0.35
+"""L, over the image's width."""
+MOST = 150
+"""Stars, the brightest: the cost goes with their cube."""
+
+
+def displaced(fit: Refined, centroids: Centroids, camera: Camera, sky: Sky, prior: LensPrior) -> Refined:
+    """The fit with the attitude and covariance that a smooth displacement leaves. prior: of the lens, as the fit had it.
+
+    Fits of fewer than three stars come back as they are.
+    """
+    i = fit.identification
+    stars, detections = i.stars[:MOST], i.detections[:MOST]
+    if len(stars) < 3:
+        return fit
+    R, lens, square = matrix_of_quaternion(i.q_SN), Lens.of(camera, prior), np.array([1.0, camera.aspect])
+    predicted, J = lens.predict(R, fit.lens, sky.directions[stars])
+    y, J = (centroids.xy_px[detections] - predicted) * square, J * square[:, None]
+    place = (predicted - [camera.cx, camera.cy]) * square
+    C = centroids.covariance_px[detections]
+    variance = 0.5 * (C[:, 0, 0] + C[:, 1, 1] * camera.aspect**2)
+    size = np.hypot(*y.T)
+    weight = np.minimum(1.0, HUBER * np.median(size) / np.maximum(size, 1e-12))
+    known, pull = lens.prior(fit.lens)
+    # In units in which the information is about one: priors span many orders.
+    unit = 1.0 / np.sqrt(np.square(J).sum(axis=(0, 1)) / np.median(variance) + known)
+    # What parameters, in their units, and the field in the middle make of the attitude: turns (3,).
+    T = np.zeros((3, 11))
+    T[:, :3] = np.diag(unit[:3])
+    T[0, 10], T[1, 9] = -1.0 / fit.camera.focal_px, 1.0 / fit.camera.focal_px
+    logs, means, covariances = [], [], []
+    far = np.sqrt(np.square(place[:, None] - place).sum(axis=2))
+    shape, middle = _matern(far, REACH * camera.width), _matern(np.hypot(*place.T), REACH * camera.width)
+    for amplitude in AMPLITUDES * camera.width:
+        expected = -math.log1p((amplitude / (EXPECTED * camera.width)) ** 2)
+        for noise in NOISES * camera.width:
+            V = amplitude**2 * shape + np.diag((variance + noise**2) / weight)
+            log, mean, covariance = _kriged(
+                V, amplitude**2 * middle, amplitude, y, J * unit, known * unit**2, pull * unit
+            )
+            logs.append(log + expected)
+            means.append(T @ mean)
+            covariances.append(T @ covariance @ T.T)
+    share = np.exp(np.array(logs) - max(logs))
+    share /= share.sum()
+    mean = share @ np.array(means)
+    off = np.array(means) - mean
+    P = np.einsum("k,kij->ij", share, np.array(covariances)) + (off * share[:, None]).T @ off
+    return replace(fit, identification=turned(i, turn(mean, R), P))
+
+
+def _matern(far: np.ndarray, reach: float) -> np.ndarray:
+    a = math.sqrt(5.0) / reach * far
+    return (1.0 + a + a * a / 3.0) * np.exp(-a)
+
+
+def _kriged(
+    V: np.ndarray, middle: np.ndarray, amplitude: float, y: np.ndarray, J: np.ndarray, known: np.ndarray, pull: np.ndarray
+) -> tuple[float, np.ndarray, np.ndarray]:  # fmt: skip
+    """Log likelihood, and mean (11,) and covariance (11, 11) of the nine parameters and the field in the middle, x and y.
+
+    V (n, n): of the residuals y (n, 2) of either axis; middle (n,): of the field there with them; J (n, 2, 9)."""
+    from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+    L = np.linalg.cholesky(V)
+    white = solve_triangular(L, np.column_stack([J[:, 0], J[:, 1], y, middle]), lower=True)
+    Jx, Jy, rx, ry, m = white[:, :9], white[:, 9:18], white[:, 18], white[:, 19], white[:, 20]
+    S = Jx.T @ Jx + Jy.T @ Jy + np.diag(known)
+    factor = cho_factor(S + 1e-12 * np.eye(9))
+    g = Jx.T @ rx + Jy.T @ ry + pull
+    delta, P = cho_solve(factor, g), cho_solve(factor, np.eye(9))
+    log = (
+        -0.5 * (rx @ rx + ry @ ry - g @ delta)
+        - 2.0 * np.log(np.diagonal(L)).sum()
+        - np.log(np.diagonal(factor[0])).sum()
+    )
+    B = np.stack([m @ Jx, m @ Jy])  # what the field takes of a step of the parameters
+    field = np.array([m @ rx, m @ ry]) - B @ delta
+    left = max(amplitude**2 - float(m @ m), 0.0)
+    T = np.concatenate([np.eye(9), -B])
+    covariance = T @ P @ T.T
+    covariance[[9, 10], [9, 10]] += left
+    return float(log), np.concatenate([delta, field]), covariance
+
+
+__all__ = ["displaced"]
