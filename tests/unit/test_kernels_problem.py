@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -44,6 +45,9 @@ def assert_alike(a: tuple[Detections, np.ndarray], b: tuple[Detections, np.ndarr
     # Sums of at most 120 terms of at most one, whose logs are about -13 and 0.
     for name in ("log_density", "log_magnitude_density"):
         assert getattr(d, name) == pytest.approx(getattr(e, name), abs=1e-12, nan_ok=True)
+    assert d.in_c == pytest.approx(e.in_c, abs=1e-10, nan_ok=True)
+    assert d.vacancy == pytest.approx(d.in_c[5 * len(d) : 6 * len(d) + 1], abs=1e-13)
+    assert replace(d).in_c == pytest.approx(d.in_c, abs=1e-13, nan_ok=True)
     assert np.array_equal(d.low, e.low)
     assert np.array_equal(d.high, e.high)
 

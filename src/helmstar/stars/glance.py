@@ -80,11 +80,11 @@ def follow(
 def plain(sky: Sky, fit: Fit, detections: np.ndarray, q_SB: np.ndarray | None) -> Identification:
     """A fit as an identification that is solved. detections: (k,) in the caller's list."""
     R, residuals = fit.R, fit.residuals.ravel()
+    x, y, z = R[2].tolist()
     q_SN = quaternion_of(R)
     q_BN = q_SN if q_SB is None else quaternion_of(matrix_of_quaternion(q_SB).T @ R)
     return Identification(
-        "solved", q_SN, q_BN, np.linalg.inv(fit.information)[:3, :3],
-        math.atan2(R[2, 1], R[2, 0]) % (2.0 * math.pi), math.asin(max(-1.0, min(1.0, R[2, 2]))),
+        "solved", q_SN, q_BN, fit.covariance[:3, :3], math.atan2(y, x) % (2.0 * math.pi), math.asin(max(-1.0, min(1.0, z))),
         math.atan2(-R[0, 2], -R[1, 2]) % (2.0 * math.pi), detections, fit.stars, sky.catalog.hip[fit.stars],
         fit.residuals, math.sqrt(residuals @ residuals / residuals.size) / fit.f, fit.f, fit.zero_point,
         probability_false([fit]), fit.log_odds, 0,
@@ -100,7 +100,8 @@ def quaternion_of(R: np.ndarray) -> np.ndarray:
         (c + g, f + h, 1.0 - a - e + i, d - b),
         (h - f, c - g, d - b, 1.0 + a + e + i),
     )
-    x, y, z, w = rows[max(range(4), key=lambda k: rows[k][k])]
+    diagonal = [rows[k][k] for k in range(4)]
+    x, y, z, w = rows[diagonal.index(max(diagonal))]
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     return np.array([x / norm, y / norm, z / norm, w / norm])
 

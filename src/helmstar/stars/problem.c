@@ -75,8 +75,8 @@ static void densities(const Eye *e, int64_t n, const double *p, const double *m,
 }
 
 /* Number k of the detections that count, at most `most`: their places in the list, order (k,), and one after the other in `out` xy
-   (k, 2), covariance (k, 2, 2), sigma, magnitude, log density of magnitudes and of places (k,). xy (n, 2), C (n, 2, 2) and m (n,),
-   NULL where brightness is unknown. -1 where there is no memory. */
+   (k, 2), sigma, log density of places and of magnitudes (k,), vacancy (k + 1,), magnitude (k,), which is how verify.c reads them, and
+   covariance (k, 2, 2). xy (n, 2), C (n, 2, 2) and m (n,), NULL where brightness is unknown. -1 where there is no memory. */
 int64_t helmstar_prepare(
     int64_t n, const double *xy, const double *C, const double *m, const Eye *e, int64_t most, int64_t *order, double *out)
 {
@@ -106,7 +106,11 @@ int64_t helmstar_prepare(
         if (alone)
             order[count++] = entry[k].index;
     }
-    double *cov = out + 2 * count, *sigma = out + 6 * count, *magnitude = sigma + count;
+    double *sigma = out + 2 * count, *places = sigma + count, *vacancy = places + 2 * count, *magnitude = vacancy + count + 1;
+    double *cov = magnitude + count;
+    vacancy[0] = 0.0;
+    for (int64_t k = 0; k < count; k++)
+        vacancy[k + 1] = vacancy[k] + log(((double)count + 1.0) / (double)(count - k));
     memcpy(out, p, sizeof(double) * (size_t)(2 * count));
     for (int64_t k = 0; k < count; k++) {
         const double *c = C + 4 * order[k];
@@ -115,7 +119,7 @@ int64_t helmstar_prepare(
         sigma[k] = sqrt(0.5 * (cov[4 * k] + cov[4 * k + 3]));
         magnitude[k] = m == NULL ? 0.0 : m[order[k]];
     }
-    densities(e, count, out, m == NULL ? NULL : magnitude, magnitude + count, magnitude + 2 * count);
+    densities(e, count, out, m == NULL ? NULL : magnitude, places + count, places);
     free(entry);
     free(p);
     return count;

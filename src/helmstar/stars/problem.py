@@ -90,7 +90,7 @@ class Detections:
 @dataclass(frozen=True)
 class Fit:
     """An attitude with its matches: R (3, 3) = R_SN, f in px, stars and detections (k,) by index, log_odds against "all
-    false", sigma_scale the factor on the detections' sigma, information (4, 4) of (theta in S, ln f) with that factor."""
+    false", sigma_scale the factor on the detections' sigma, covariance (4, 4) of (theta in S, ln f) with that factor."""
 
     R: np.ndarray
     f: float
@@ -100,7 +100,7 @@ class Fit:
     log_odds: float
     sigma_scale: float
     zero_point: float
-    information: np.ndarray
+    covariance: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -161,9 +161,14 @@ def prepare(
     library = kernels()
     if library is None:
         order, p, C, sigma, m, density, places = _listed(xy, C, m, camera, width * height * a)
-    else:
-        order, p, C, sigma, m, density, places = _compiled(library, xy, C, m, camera, width * height * a)
-    return Detections(p, sigma, m, magnitude_sigma, zero_point, density, places, low, high, order), C
+        return Detections(p, sigma, m, magnitude_sigma, zero_point, density, places, low, high, order), C
+    order, listed, C = _compiled(library, xy, C, m, camera, width * height * a)
+    k = len(order)
+    sigma, places, density = listed[2 * k : 5 * k].reshape(3, k)
+    p, m = listed[: 2 * k].reshape(k, 2), None if m is None else listed[6 * k + 1 :]
+    d = Detections(p, sigma, m, magnitude_sigma, zero_point, density, places, low, high, order)
+    d.__dict__["in_c"] = listed  # where the cached property would put the same
+    return d, C
 
 
 def _listed(xy: np.ndarray, C: np.ndarray, m: np.ndarray | None, camera: Camera, area: float) -> tuple:
@@ -192,8 +197,8 @@ def _listed(xy: np.ndarray, C: np.ndarray, m: np.ndarray | None, camera: Camera,
 
 def _compiled(
     library: ctypes.CDLL, xy: np.ndarray, C: np.ndarray, m: np.ndarray | None, camera: Camera, area: float
-) -> tuple:
-    """As `_listed`, by problem.c."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As `_listed`, by problem.c: order, what is `in_c` of the detections, and covariance."""
     xy, C = np.ascontiguousarray(xy), np.ascontiguousarray(C)
     m = None if m is None else np.ascontiguousarray(m)
     (x, y), (k1, k2, p1, p2, k3) = camera.centre_px, camera.distortion
@@ -201,7 +206,7 @@ def _compiled(
         x, y, camera.aspect, camera.focal_px, k1, k2, p1, p2, k3, area, MAGNITUDE_WIDTH, CROWDED_PX
     )
     room = min(len(xy), MOST_DETECTIONS)
-    order, out = np.empty(room, dtype=np.int64), np.empty(10 * room)
+    order, out = np.empty(room, dtype=np.int64), np.empty(11 * room + 1)
     k = library.helmstar_prepare(
         ctypes.c_int64(len(xy)), ctypes.c_void_p(address(xy)), ctypes.c_void_p(address(C)),
         ctypes.c_void_p(None if m is None else address(m)), eye, ctypes.c_int64(room),
@@ -209,9 +214,7 @@ def _compiled(
     )  # fmt: skip
     if k < 0:
         raise MemoryError("no room for the detections")
-    sigma, magnitude, density, places = out[6 * k : 10 * k].reshape(4, k)
-    p, C = out[: 2 * k].reshape(k, 2), out[2 * k : 6 * k].reshape(k, 2, 2)
-    return order[:k], p, C, sigma, None if m is None else magnitude, density, places
+    return order[:k], out[: 7 * k + 1], out[7 * k + 1 : 11 * k + 1].reshape(k, 2, 2)
 
 
 def _crowded(p: np.ndarray) -> np.ndarray:

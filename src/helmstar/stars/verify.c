@@ -7,7 +7,7 @@
 
 #define MOST 512  /* detections */
 #define DEEP 398  /* stars, for which the table of factorials has one more */
-#define HEAD 29   /* numbers of a fit before its residuals: R (3, 3), f, log odds, zero point, information (4, 4), scale */
+#define HEAD 29   /* numbers of a fit before its residuals: R (3, 3), f, log odds, zero point, covariance (4, 4), scale */
 
 static const double TURN = 2.0 * 3.14159265358979323846;
 
@@ -195,6 +195,31 @@ static double eliminate(double A[4][4], double g[4], double *logarithm)
     return sign;
 }
 
+/* A x = g, in place: x is left in g. The determinant's sign, 0 where there is no solution. */
+static double solve(double A[4][4], double g[4])
+{
+    double logarithm, sign = eliminate(A, g, &logarithm);
+    for (int r = 3; r >= 0 && sign != 0.0; r--) {
+        for (int k = r + 1; k < 4; k++)
+            g[r] -= A[r][k] * g[k];
+        g[r] /= A[r][r];
+    }
+    return sign;
+}
+
+/* As `covariance_of`. */
+static void invert(double information[4][4], double *covariance)
+{
+    for (int c = 0; c < 4; c++) {
+        double A[4][4], g[4] = {0.0};
+        memcpy(A, information, sizeof A);
+        g[c] = 1.0;
+        double sign = solve(A, g);
+        for (int r = 0; r < 4; r++)
+            covariance[4 * r + c] = sign != 0.0 ? g[r] : NAN;
+    }
+}
+
 /* As `turn`: R becomes exp([theta x]) R. */
 static void turn(const double *theta, double *R)
 {
@@ -213,7 +238,7 @@ static void turn(const double *theta, double *R)
 /* Gauss and Newton's step of R and f; far residuals of a wide gate pull less. 0 where it has no solution. */
 static int step(const Field *q, const Match *m, int64_t count, double widen, double *R, double *f)
 {
-    double A[4][4], g[4], soft[DEEP], logarithm, damp = 0.0;
+    double A[4][4], g[4], soft[DEEP], damp = 0.0;
     for (int64_t k = 0; k < count; k++)
         soft[k] = m[k].sigma * sqrt(1.0 + m[k].square / (2.0 * widen * (2.0 * widen)));
     normal(q, m, count, soft, *f, A, g);
@@ -221,13 +246,8 @@ static int step(const Field *q, const Match *m, int64_t count, double widen, dou
         damp += A[r][r];
     for (int r = 0; r < 4; r++)
         A[r][r] += 1e-12 * damp + 1e-9;
-    if (eliminate(A, g, &logarithm) == 0.0)
+    if (solve(A, g) == 0.0)
         return 0;
-    for (int r = 3; r >= 0; r--) {
-        for (int k = r + 1; k < 4; k++)
-            g[r] -= A[r][k] * g[k];
-        g[r] /= A[r][r];
-    }
     turn(g, R);
     *f = within(*f * exp(within(g[3], -0.1, 0.1)), 0.97 * q->f_low, 1.03 * q->f_high);
     return 1;
@@ -305,7 +325,7 @@ static int64_t at_scale(
                 return 0;
             if (round == rounds) {
                 fit[10] = odds, fit[11] = zero, fit[28] = scale;
-                memcpy(fit + 12, information, sizeof information);
+                invert(information, fit + 12);
                 for (int64_t k = 0; k < good; k++) {
                     star[k] = seen[weighed[k].rank].star, detection[k] = weighed[k].j;
                     fit[HEAD + 2 * k] = weighed[k].dx, fit[HEAD + 2 * k + 1] = weighed[k].dy;

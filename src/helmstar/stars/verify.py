@@ -35,6 +35,7 @@ ZERO_POINT_RANGE = 10.0
 """Where an unknown zero point may lie (mag, full width): sets the price of fitting it."""
 LOG_FACTORIAL = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1.0, 400.0)))])
 HARMONIC = np.concatenate([[1.0], np.cumsum(1.0 / np.arange(1.0, 400.0))])
+_TABLES = address(LOG_FACTORIAL), address(HARMONIC)
 SO3_VOLUME = 8.0 * np.pi**2
 LEAST_PROBABILITY = 1e-99
 """Below this a probability is a figure of the model, not of the world."""
@@ -88,8 +89,9 @@ def stars_near(sky: Sky, level: int, R: np.ndarray, f: float, d: Detections) -> 
 def _circle(R: np.ndarray, f: float, d: Detections) -> tuple[np.ndarray, float]:
     """Middle (3,) and radius (rad) of a circle around the image."""
     (left, top), (right, bottom) = d.low.tolist(), d.high.tolist()
-    axis = np.array([0.5 * (left + right), 0.5 * (top + bottom), f]) @ R
-    return axis / math.sqrt(axis @ axis), 1.03 * math.atan(0.5 * math.hypot(right - left, bottom - top) / f)
+    x, y = 0.5 * (left + right), 0.5 * (top + bottom)
+    half = 0.5 * math.hypot(right - left, bottom - top)
+    return np.array([x, y, f]) @ R / math.hypot(x, y, f), 1.03 * math.atan(half / f)
 
 
 def expected_stars(sky: Sky, level: int, R: np.ndarray, f: float, d: Detections, limit: int) -> np.ndarray:
@@ -148,6 +150,14 @@ def step(u, residual, sigma, f, freedom: Freedom) -> tuple[np.ndarray, np.ndarra
     # A whisper of a prior keeps two coincident stars from a singular matrix; no real geometry notices.
     damped = information + np.diag(np.full(4, 1e-12 * information.trace() + 1e-9))
     return np.linalg.solve(damped, g), information
+
+
+def covariance_of(information: np.ndarray) -> np.ndarray:
+    """Inverse (4, 4) of a fit's information; NaN where it has none."""
+    try:
+        return np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        return np.full((4, 4), np.nan)
 
 
 def zero_point_price(d: Detections, count: int) -> float:
@@ -231,21 +241,12 @@ class _InC(ctypes.Structure):
 
     _fields_ = (
         [(k, ctypes.c_int64) for k in ("n", "stars", "limit", "has_magnitude", "knows_zero", "is_free")]
-        + [
-            (k, ctypes.c_double)
-            for k in ("low_x", "low_y", "high_x", "high_y", "faintest", "magnitude_sigma", "zero_point")
-        ]
-        + [
-            (k, ctypes.c_double)
-            for k in ("zero_point_range", "broad_share", "broad_sigma", "f_low", "f_high", "f_known")
-        ]
+        + [(k, ctypes.c_double) for k in ("low_x", "low_y", "high_x", "high_y", "faintest", "magnitude_sigma", "zero_point")]
+        + [(k, ctypes.c_double) for k in ("zero_point_range", "broad_share", "broad_sigma", "f_low", "f_high", "f_known")]
         + [(k, ctypes.c_double) for k in ("f_weight", "log_volume", "gate", "hopeless")]
-        + [
-            (k, ctypes.c_void_p)
-            for k in ("xy", "sigma", "log_density", "log_magnitude_density", "vacancy", "magnitude")
-        ]
+        + [(k, ctypes.c_void_p) for k in ("xy", "sigma", "log_density", "log_magnitude_density", "vacancy", "magnitude")]
         + [(k, ctypes.c_void_p) for k in ("r", "V", "log_factorial", "harmonic")]
-    )
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -311,7 +312,7 @@ class _Field:
                 total += float(fit_volumes(information[None], freedom, self.volume)[0])
                 if turn_number == rounds:
                     stars = self.candidates[seen[i[good]]]
-                    return Fit(R, f, stars, j[good], residual[good], total, scale, zero, information)
+                    return Fit(R, f, stars, j[good], residual[good], total, scale, zero, covariance_of(information))
                 if total < HOPELESS:
                     return None
             else:
@@ -331,14 +332,14 @@ class _Field:
             raise ValueError(
                 f"stars have the shapes {self.r.shape} and {self.V.shape}, not {(stars, 3)} and {(stars,)}"
             )
-        arrays = [np.ascontiguousarray(x, dtype=float) for x in (d.in_c, self.r, self.V, LOG_FACTORIAL, HARMONIC)]
-        listed, *rest = (address(x) for x in arrays)
+        arrays = [np.ascontiguousarray(x, dtype=float) for x in (d.in_c, self.r, self.V)]
+        listed, r, V = (address(x) for x in arrays)
         return _InC(
             n, stars, self.limit, d.magnitude is not None, d.zero_point is not None, freedom.free,
             *d.low.tolist(), *d.high.tolist(), d.faintest, d.magnitude_sigma, d.zero_point or 0.0, ZERO_POINT_RANGE,
             BROAD_SHARE, broad_sigma(d), freedom.f_low, freedom.f_high, freedom.f_known, 1.0 / max(freedom.sigma, 1e-6) ** 2,
             math.log(self.volume * focal_volume(freedom)), GATE, HOPELESS,
-            *(listed + 8 * k for k in (0, 2 * n, 3 * n, 4 * n, 5 * n, 6 * n + 1)), *rest,
+            *(listed + 8 * k for k in (0, 2 * n, 3 * n, 4 * n, 5 * n, 6 * n + 1)), r, V, *_TABLES,
         ), arrays  # fmt: skip
 
     def _compiled(
