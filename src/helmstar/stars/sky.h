@@ -60,12 +60,8 @@ static inline int64_t in_circle(
             marks[s->member[k] >> 6] |= (uint64_t)1 << (s->member[k] & 63);
     }
     for (int64_t word = 0; word < words(s->stars); word++)
-        if (marks[word]) {
-            for (int64_t bit = 0; bit < 64; bit++)
-                if (marks[word] >> bit & 1)
-                    found[count++] = 64 * word + bit;
-            marks[word] = 0;
-        }
+        for (; marks[word]; marks[word] &= marks[word] - 1)
+            found[count++] = 64 * word + __builtin_ctzll(marks[word]);
     return count;
 }
 
