@@ -30,7 +30,7 @@ from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
 from ..stars.track import WIDEST_PX, track
 from .displaced import displaced
-from .lens import LensPrior
+from .lens import PARAMETERS, LensPrior
 from .refine import EPOCH_SPREAD_YEARS, Refined, refine
 
 FOCAL_SIGMA = 0.005
@@ -293,25 +293,28 @@ class StarTracker:
             return self.camera, None, CALIBRATED_SIGMA
         if isinstance(self.fov_deg, tuple):
             low, high = self.fov_deg
-            camera = Camera.from_fov(math.sqrt(low * high), width, height, self.aspect)
+            camera = _of_field(math.sqrt(low * high), width, height, self.aspect)
             return camera, (math.radians(low), math.radians(high)), FOCAL_SIGMA
         assert self.fov_deg is not None
-        return Camera.from_fov(self.fov_deg, width, height, self.aspect), None, FOCAL_SIGMA
+        return _of_field(self.fov_deg, width, height, self.aspect), None, FOCAL_SIGMA
+
+
+_of_field = cache(Camera.from_fov)
 
 
 def _displaced_px(fit: Refined, believed_px: float) -> float:
-    """By how much, 1 sigma per axis, a fit's stars are displaced: its residuals, of the freedom that seven parameters left, and
+    """By how much, 1 sigma per axis, a fit's stars are displaced: its residuals, of the freedom that the parameters left, and
     what was believed before, as worth as `BELIEF` coordinates; no more than that."""
     i = fit.identification
     chi2 = 2.0 * len(i.stars) * (i.residual_rms * fit.camera.focal_px) ** 2
-    free = max(2.0 * len(i.stars) - 7.0, 0.0)
+    free = max(2.0 * len(i.stars) - PARAMETERS, 0.0)
     return min(believed_px, math.sqrt((BELIEF * believed_px**2 + chi2) / (BELIEF + free)))
 
 
 def _bright_share(fit: Refined, centroids: Centroids) -> float:
     """Share of the brightest detections that a fit explains: the flux comes sorted."""
     count = min(len(centroids), BRIGHTEST)
-    return float((fit.identification.detections < count).sum() / max(count, 1))
+    return np.count_nonzero(fit.identification.detections < count) / max(count, 1)
 
 
 def _smooth(fit: Refined, sigma_px: float, camera: Camera) -> Refined:
