@@ -48,7 +48,7 @@ def helmstar_program(width: int, steps: int):
     def one(u, z):
         inputs = GyroInput(u, jnp.zeros((steps, 3, 3)))
         m = Measurement(z, r, jnp.ones((steps, 2), dtype=bool))
-        keep = lambda b, p, i: (b.mean.q_BN, i[0].nis)  # noqa: E731
+        keep = lambda b, p, i: (b.mean.q_BN, i[0].nis)
         return run(filter, model, start, inputs, jnp.full(steps, DT), (m,), no_gate(8), keep=keep)[2]
 
     shape = (jax.ShapeDtypeStruct((width, steps, 3), float), jax.ShapeDtypeStruct((width, steps, 2, 3), float))

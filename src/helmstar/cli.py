@@ -202,7 +202,7 @@ def _solve(args: argparse.Namespace) -> int:
 def _render(args: argparse.Namespace) -> int:
     from .startracker.render_command import RenderOptions, print_rendered, run_render
 
-    path = lambda text: None if text is None else Path(text)  # noqa: E731
+    path = lambda text: None if text is None else Path(text)
     result = run_render(
         RenderOptions(
             args.ra, args.dec, args.roll, fov_deg=args.fov, size=args.size, camera=path(args.camera), time=args.time,

@@ -37,7 +37,7 @@ def test_the_factor_of_every_law_is_that_of_a_disc_of_pixels(law, degrees):
 @pytest.mark.parametrize("degrees", [5.0, 72.0, 140.0])
 def test_lambert_against_adaptive_quadrature(degrees):
     a = np.radians(degrees)
-    f = lambda b, L, k: np.cos(b) ** (3 + k) * np.cos(L) * np.cos(L - a) * np.sin(L) ** k  # noqa: E731
+    f = lambda b, L, k: np.cos(b) ** (3 + k) * np.cos(L) * np.cos(L - a) * np.sin(L) ** k
     sums = [dblquad(f, a - np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, args=(k,))[0] for k in (1, 0)]
     assert float(lambert_factor(a)) == pytest.approx(sums[0] / sums[1], abs=1e-9)
 

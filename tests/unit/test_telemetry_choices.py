@@ -207,7 +207,7 @@ def test_without_calibration_the_same_record_is_inconsistent(tmp_path):
 
 def test_what_a_record_does_not_show_is_not_estimated(tmp_path):
     """A turn about x alone: it shows the scale factor of x and misalignments about y and z, and nothing about x, y, z else."""
-    rate = lambda t: constant((1.0, 0.0, 0.0))(t) * np.clip(np.asarray(t) / 100.0 - 1.0, -1.0, 1.0)[..., None]  # noqa: E731
+    rate = lambda t: constant((1.0, 0.0, 0.0))(t) * np.clip(np.asarray(t) / 100.0 - 1.0, -1.0, 1.0)[..., None]
     setup = replace(BASE, rate=rate, misalignment_arcsec=MU, scale_ppm=SCALE)
     run = solve_setup(setup, tmp_path, filter=CALIBRATE)
     c = run.result["calibration"]

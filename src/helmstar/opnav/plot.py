@@ -37,7 +37,7 @@ def draw(image: Image, scene: Any, found: FigureCentre, path: Path) -> Path:
     shape = (max(round((x1 - x0) * scale), 1), max(round((y1 - y0) * scale), 1))
     picture = Picture.fromarray(grey.astype(np.uint8)).resize(shape, Picture.Resampling.NEAREST).convert("RGB")
     pen = ImageDraw.Draw(picture)
-    place = lambda xy: ((xy[0] - x0 + 0.5) * scale, (xy[1] - y0 + 0.5) * scale)  # noqa: E731
+    place = lambda xy: ((xy[0] - x0 + 0.5) * scale, (xy[1] - y0 + 0.5) * scale)
     if scene is not None and isinstance(scene[0].target.shape, Ellipsoid):
         from ..imaging.body.limb import outline_px
 

@@ -66,7 +66,7 @@ class Trajectory:
         time = np.asarray(time, float)
         state = states(self.unknowns[:6], time - self.epoch, self.gm)
         h = np.maximum(1e-3 * np.sqrt(np.maximum(np.diagonal(self.covariance)[:6], 0.0)), 1e-6)
-        after = lambda e: states(self.unknowns[:6] + e, time - self.epoch, self.gm)  # noqa: E731
+        after = lambda e: states(self.unknowns[:6] + e, time - self.epoch, self.gm)
         F = np.stack([(after(e) - after(-e)) / (2.0 * e.max()) for e in np.diag(h)], axis=-1)
         return state, F @ self.covariance[:6, :6] @ np.swapaxes(F, -1, -2)
 

@@ -183,7 +183,7 @@ class Experiment:
 
         noise = GyroNoise(*(_number(v) for v in (self.sigma_v, self.sigma_u)))
         rates = RateNoise(*(_number(v) for v in (rate_sigma, self.sigma_u)))
-        stars = lambda r: (unit_star_directions(_number(self.star_sigma), r),)  # noqa: E731
+        stars = lambda r: (unit_star_directions(_number(self.star_sigma), r),)
         left, right, mrp = (attitude_drift_model(noise, r, stars(r)) for r in (so3_left, so3_right, mrp_left))
         rated = attitude_rate_model(rates, so3_left, (gyro_rate(), *stars(so3_left)))
         printed = paper.printed_model(noise)

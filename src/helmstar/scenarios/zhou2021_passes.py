@@ -196,7 +196,7 @@ def estimate(
         q0_cov = data.q_cov[0]
         sign = jnp.where(jnp.sum(data.q_star[0] * shared.q[0]) < 0.0, -1.0, 1.0)  # q_0 is right, as (13) needs it
         start = make_belief(filter, rated, prior, sign * data.q_star[0], q0_cov, data.rate[0])
-        turn = lambda a: quaternion.exp(a * data.axis)  # noqa: E731
+        turn = lambda a: quaternion.exp(a * data.axis)
 
         def begin(belief: Any, saved: Any, last: Array, x: Any) -> tuple[Any, Array]:
             """The belief with which a step begins, and the last continuous q_star."""
@@ -206,7 +206,7 @@ def estimate(
             upset = saved.__class__(**{**vars(saved), "mean": mean})
             off = quaternion.multiply(turn(x.turn), shared.q[0])
             wrong = make_belief(filter, rated, prior, off, prior.wrong**2 * jnp.eye(3), data.rate[0])
-            pick = lambda a, b, c: jnp.where(x.begin == CONTINUE, a, jnp.where(x.begin == FROM_WRONG, c, b))  # noqa: E731
+            pick = lambda a, b, c: jnp.where(x.begin == CONTINUE, a, jnp.where(x.begin == FROM_WRONG, c, b))
             return (
                 jax.tree.map(pick, belief, upset, wrong),
                 jnp.where(x.begin == CONTINUE, last, shared.q[x.index]),

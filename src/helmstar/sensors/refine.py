@@ -183,7 +183,7 @@ class _Fit:
 def _fit(q: _Problem, R: np.ndarray, p: np.ndarray, i: np.ndarray, j: np.ndarray) -> _Fit:
     """Gauss and Newton's steps from R, p and the matches i, j, which are looked for again at each."""
     lens, xy, C, drift, best = q.lens, q.xy, q.covariance, q.drift, None
-    spread = lambda i, j: C[j] + drift[i, None, None] ** 2 * lens.round  # noqa: E731
+    spread = lambda i, j: C[j] + drift[i, None, None] ** 2 * lens.round
     agree = np.abs(q.V[:, None] - q.magnitude - q.zero) < q.magnitude_gate
     residual = np.zeros((0, 2))
     for _ in range(_STEPS):

@@ -217,7 +217,7 @@ def print_calibrated(result: dict[str, Any]) -> None:
             f"{e['residual_rms_arcsec']:.3g} arcsec, {e['outliers']} outliers"
         )
     c, s = result["camera"], result["sigma"]
-    pm = lambda name: f" +- {s[name]:.2g}" if name in s else ""  # noqa: E731
+    pm = lambda name: f" +- {s[name]:.2g}" if name in s else ""
     print(
         f"focal length {c['focal_px']:.2f}{pm('focal')} px (field {c['fov_deg']:.4f} deg), centre "
         f"{c['centre_px'][0]:.1f}{pm('cx')}, {c['centre_px'][1]:.1f}{pm('cy')} px, aspect {c['aspect']:.5f}{pm('aspect')}"

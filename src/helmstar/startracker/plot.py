@@ -27,7 +27,7 @@ def draw(image: Image, found: StarSolution, catalog: Catalog, path: Path) -> Pat
     size = (max(round(image.width * scale), 1), max(round(image.height * scale), 1))
     picture = Picture.fromarray(_stretched(image.array)).resize(size).convert("RGB")
     pen = ImageDraw.Draw(picture)
-    place = lambda xy: ((xy[0] + 0.5) * scale, (xy[1] + 0.5) * scale)  # noqa: E731
+    place = lambda xy: ((xy[0] + 0.5) * scale, (xy[1] + 0.5) * scale)
     for xy in found.centroids.xy_px:
         x, y = place(xy)
         pen.ellipse((x - 7, y - 7, x + 7, y + 7), outline=FOUND)

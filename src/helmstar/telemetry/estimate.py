@@ -139,7 +139,7 @@ def _forward(
 @partial(jax.jit, static_argnames=("filter",))
 def _backward(filter: Any, begin: Any, track: Any, later: Gaussian) -> Gaussian:
     """Smoothed beliefs at the begin of a chunk and after each of its steps; `later` is the one at its end."""
-    front = lambda a, b: jnp.concatenate([a[None], b])  # noqa: E731
+    front = lambda a, b: jnp.concatenate([a[None], b])
     filtered = Gaussian(jax.tree.map(front, begin.mean, track.belief.mean), front(begin.cov, track.belief.cov))
     predicted = jax.tree.map(lambda a: front(a[0], a), track.predicted)  # the first one is not looked at
     breaks = None

@@ -167,7 +167,7 @@ class _Problem:
         columns = [-gx, -gy, -(dx[None, :] * gx + dy[:, None] * gy), 0.5 * around * here.psf_sigma_px**2]
         if self.free:
             weights = s.found[:-1] * s.scales
-            draw = lambda p: here.draw(  # noqa: E731
+            draw = lambda p: here.draw(
                 self.trial(p), self.at, law=self.law, with_family=self.with_family, weights=weights
             )[0]
             base = draw(p)

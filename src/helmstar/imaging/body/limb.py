@@ -209,7 +209,7 @@ def _fit(
         stretch = sum(a * E for a, E in zip(p[3:], _STRETCH)) if free else None
         return Trial(p[:2], math.exp(p[2]), None if stretch is None else np.asarray(stretch))
 
-    distance = lambda p: outline_distance(scene, trial_of(p), points)  # noqa: E731
+    distance = lambda p: outline_distance(scene, trial_of(p), points)
     sigma = np.hypot(sigma, 0.02)
     A, chi2, kept = np.eye(len(p)), 1.0, np.ones(len(points), bool)
     for _ in range(8):
