@@ -19,62 +19,84 @@ from ..stars.identify import matrix_of_quaternion
 from ..stars.patterns import Sky
 from ..stars.verify import turn
 from .lens import Lens, LensPrior
-from .refine import HUBER, Refined, turned
+from .refine import ASTRAY, BENT_PX, HUBER, Refined, turned
 
 EXPECTED = 0.0015
 """Of the image's width: the field's amplitude A above which it is less and less expected."""
-AMPLITUDES = np.geomspace(0.0001, 0.0064, 7)
+AMPLITUDES = np.geomspace(0.0001, 0.0128, 8)
 NOISES = np.geomspace(0.00002, 0.00256, 8)
 """A and w that are tried, over the image's width."""
 REACH = 0.35
 """L, over the image's width."""
 MOST = 150
 """Stars, the brightest: the cost goes with their cube."""
+STEPS = 8
+"""At most, of Gauss and Newton."""
 
 
 def displaced(fit: Refined, centroids: Centroids, camera: Camera, sky: Sky, prior: LensPrior) -> Refined:
-    """The fit with the attitude and covariance that a smooth displacement leaves. prior: of the lens, as the fit had it.
+    """The fit with attitude, lens and covariance that a smooth displacement leaves. prior: of the lens, as the fit had it.
 
-    Fits of fewer than three stars come back as they are.
+    Fits of fewer than three stars, and those that run away, come back as they are.
     """
     i = fit.identification
     stars, detections = i.stars[:MOST], i.detections[:MOST]
     if len(stars) < 3:
         return fit
-    R, lens, square = matrix_of_quaternion(i.q_SN), Lens.of(camera, prior), np.array([1.0, camera.aspect])
-    predicted, J = lens.predict(R, fit.lens, sky.directions[stars])
-    y, J = (centroids.xy_px[detections] - predicted) * square, J * square[:, None]
-    place = (predicted - [camera.cx, camera.cy]) * square
-    C = centroids.covariance_px[detections]
+    xy, C, d_N = centroids.xy_px[detections], centroids.covariance_px[detections], sky.directions[stars]
     variance = 0.5 * (C[:, 0, 0] + C[:, 1, 1] * camera.aspect**2)
+    R, p, lens = matrix_of_quaternion(i.q_SN), fit.lens, Lens.of(camera, prior)
+    for _ in range(STEPS):
+        mean, P = _step(lens, R, p, d_N, xy, variance)
+        if not (np.isfinite(mean).all() and abs(p[0] + mean[3] - fit.lens[0]) < math.log(ASTRAY)):
+            return fit
+        R, p = turn(mean[:3], R), p + mean[3:9]
+        if lens.second_order(mean[:9]) < BENT_PX:
+            break
+    # A place that is displaced by g in the middle is seen there from a direction turned by this.
+    fitted = lens.fitted(p)
+    T = np.concatenate([np.eye(3, 9), np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 0.0]]) / fitted.focal_px], axis=1)
+    residual = centroids.xy_px[i.detections] - lens.predict(R, p, sky.directions[i.stars])[0]
+    residual[:, 1] *= camera.aspect
+    found = replace(
+        turned(i, turn(T[:, 9:] @ mean[9:], R), T @ P @ T.T), residuals_px=residual, focal_px=fitted.focal_px,
+        residual_rms=math.sqrt(float(np.square(residual).mean())) / fitted.focal_px,
+    )  # fmt: skip
+    return replace(fit, identification=found, camera=fitted, lens=p)
+
+
+def _step(
+    lens: Lens, R: np.ndarray, p: np.ndarray, d_N: np.ndarray, xy: np.ndarray, variance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (11,) and covariance (11, 11) of a step of the nine parameters from R, p, and of the field in the middle, x and y in
+    pixel widths, averaged over A and w. variance: (n,) of the centroids."""
+    camera, square = lens.camera, np.array([1.0, lens.camera.aspect])
+    predicted, J = lens.predict(R, p, d_N)
+    y, J = (xy - predicted) * square, J * square[:, None]
+    place = (xy - [camera.cx, camera.cy]) * square
     size = np.hypot(*y.T)
     weight = np.minimum(1.0, HUBER * np.median(size) / np.maximum(size, 1e-12))
-    known, pull = lens.prior(fit.lens)
+    known, pull = lens.prior(p)
     # In units in which the information is about one: priors span many orders.
     unit = 1.0 / np.sqrt(np.square(J).sum(axis=(0, 1)) / np.median(variance) + known)
-    # What parameters, in their units, and the field in the middle make of the attitude: turns (3,).
-    T = np.zeros((3, 11))
-    T[:, :3] = np.diag(unit[:3])
-    T[0, 10], T[1, 9] = -1.0 / fit.camera.focal_px, 1.0 / fit.camera.focal_px
-    logs, means, covariances = [], [], []
     far = np.sqrt(np.square(place[:, None] - place).sum(axis=2))
     shape, middle = _matern(far, REACH * camera.width), _matern(np.hypot(*place.T), REACH * camera.width)
+    logs, means, covariances = [], [], []
     for amplitude in AMPLITUDES * camera.width:
         expected = -math.log1p((amplitude / (EXPECTED * camera.width)) ** 2)
         for noise in NOISES * camera.width:
             V = amplitude**2 * shape + np.diag((variance + noise**2) / weight)
-            log, mean, covariance = _kriged(
-                V, amplitude**2 * middle, amplitude, y, J * unit, known * unit**2, pull * unit
-            )
+            log, mean, P = _kriged(V, amplitude**2 * middle, amplitude, y, J * unit, known * unit**2, pull * unit)
             logs.append(log + expected)
-            means.append(T @ mean)
-            covariances.append(T @ covariance @ T.T)
+            means.append(mean)
+            covariances.append(P)
     share = np.exp(np.array(logs) - max(logs))
     share /= share.sum()
     mean = share @ np.array(means)
     off = np.array(means) - mean
     P = np.einsum("k,kij->ij", share, np.array(covariances)) + (off * share[:, None]).T @ off
-    return replace(fit, identification=turned(i, turn(mean, R), P))
+    units = np.concatenate([unit, np.ones(2)])
+    return mean * units, P * units * units[:, None]
 
 
 def _matern(far: np.ndarray, reach: float) -> np.ndarray:

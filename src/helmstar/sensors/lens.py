@@ -7,7 +7,7 @@ shows by the perspective's second order only.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -140,6 +140,18 @@ class Lens:
         J[:, 0, 7], J[:, 1, 7] = 2.0 * f * xy, f / a * (r2 + 2.0 * y * y)
         J[:, 0, 8], J[:, 1, 8] = f * (r2 + 2.0 * x * x), 2.0 * f / a * xy
         return np.stack([c.cx + ex + f * xd, c.cy + ey + f / a * yd], axis=1), J
+
+    def fitted(self, p: np.ndarray) -> Camera:
+        """The camera of p's focal length, and k1, p1, p2 added to its own: what of it folds no corner over, where no star was
+        seen."""
+        focal_px, own = self.camera.focal_px * math.exp(p[0]), self.camera.distortion
+        bent = (own[0] + float(p[3]), own[1], own[2] + float(p[4]), own[3] + float(p[5]), own[4])
+        for distortion in (bent, own):
+            try:
+                return replace(self.camera, focal_px=focal_px, distortion=distortion)
+            except ValueError:
+                continue
+        return self.camera
 
     def second_order(self, delta: np.ndarray) -> float:
         """Bound, px, on what a step (9,) leaves: products of turns, of the focal length's and of the centre's share."""

@@ -28,7 +28,7 @@ from ..imaging import Camera, Centroids
 from ..native import address, kernels
 from ..stars.glance import quaternion_of
 from ..stars.identify import Identification, matrix_of_quaternion
-from ..stars.patterns import Sky
+from ..stars.patterns import Sky, Window
 from ..stars.problem import middle
 from ..stars.verify import turn
 from .lens import PARAMETERS, Lens, LensPrior
@@ -79,7 +79,9 @@ def refine(
     of the centroids, that of their flux by default. Where fewer than three stars match, or the fit runs away, the
     identification stays as it is.
     """
-    R = matrix_of_quaternion(found.q_SN)
+    R, library = matrix_of_quaternion(found.q_SN), kernels()
+    p = np.array([math.log(found.focal_px / camera.focal_px), 0.0, 0.0, 0.0, 0.0, 0.0])
+    as_it_is = Refined(found, replace(camera, focal_px=found.focal_px), 1.0, lens=p)
     if magnitude is None:
         magnitude = -2.5 * np.log10(np.maximum(centroids.flux, 1e-12))
     zero = middle(sky.magnitude[found.stars] - magnitude[found.detections])
@@ -88,26 +90,25 @@ def refine(
     good = near[at] == found.stars if len(near) else np.zeros(len(at), bool)
     i, j = at[good], found.detections[good]
     if len(i) < _LEAST:
-        return Refined(found, replace(camera, focal_px=found.focal_px), 1.0)
+        return as_it_is
     drift = epoch_years * found.focal_px * np.hypot(sky.catalog.pm_ra[near], sky.catalog.pm_dec[near])
     density = len(centroids) / (camera.width * camera.height)
     problem = _Problem(
         Lens.of(camera, prior), d_N, V, drift, centroids.xy_px, centroids.covariance_px, magnitude, zero, magnitude_gate,
         density,
     )  # fmt: skip
-    p, library = np.array([np.log(found.focal_px / camera.focal_px), 0.0, 0.0, 0.0, 0.0, 0.0]), kernels()
     fit = _fit(problem, R, p, i, j) if library is None else _compiled(library, problem, R, p, i, j)
     if not abs(fit.p[0] - p[0]) < math.log(ASTRAY):  # nor where it is no number
-        return Refined(found, replace(camera, focal_px=found.focal_px), 1.0)
+        return as_it_is
     order = np.argsort(fit.j, kind="stable")
     i, j, residual = near[fit.i[order]], fit.j[order], fit.residual[order] * [1.0, camera.aspect]
-    focal = camera.focal_px * float(np.exp(fit.p[0]))
+    focal, flat = camera.focal_px * math.exp(fit.p[0]), residual.ravel()
     better = replace(
         turned(found, fit.R, fit.covariance[:3, :3]), stars=i, detections=j, hip=sky.catalog.hip[i], residuals_px=residual,
-        focal_px=focal, residual_rms=math.sqrt(float(np.square(residual).mean())) / focal,
+        focal_px=focal, residual_rms=math.sqrt(flat @ flat / flat.size) / focal,
     )  # fmt: skip
-    strain = float(np.sqrt(np.max(fit.p[1:] ** 2 * problem.lens.known[4:])))
-    return Refined(better, _with(camera, focal, *fit.p[3:].tolist()), fit.scale, strain, fit.p)
+    strain = math.sqrt((fit.p[1:] ** 2 * problem.lens.known[4:]).max())
+    return Refined(better, problem.lens.fitted(fit.p), fit.scale, strain, fit.p)
 
 
 def turned(found: Identification, R_SN: np.ndarray, covariance: np.ndarray) -> Identification:
@@ -123,31 +124,18 @@ def turned(found: Identification, R_SN: np.ndarray, covariance: np.ndarray) -> I
     )  # fmt: skip
 
 
-def _with(camera: Camera, focal_px: float, k1: float, p1: float, p2: float) -> Camera:
-    """The camera of another focal length, and k1, p1, p2 added to its own: what of it folds no corner over, where no star was
-    seen."""
-    own = camera.distortion
-    for distortion in ((own[0] + k1, own[1], own[2] + p1, own[3] + p2, own[4]), own):
-        try:
-            return replace(camera, focal_px=focal_px, distortion=distortion)
-        except ValueError:
-            continue
-    return camera
-
-
 def _in_view(
     sky: Sky, R: np.ndarray, camera: Camera, focal_px: float, faintest: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Indices (n,) of the stars brighter than `faintest` that a pinhole at R sees on the image and a margin of 4% around it, their
     directions (n, 3) and their V."""
     half_x, half_y = 0.54 * camera.width / focal_px, 0.54 * camera.height * camera.aspect / focal_px
-    near = sky.around(R[2], math.atan(math.hypot(half_x, half_y)))
-    d_N, V = sky.directions.take(near, axis=0), sky.magnitude.take(near)
-    x, y, z = R @ d_N.T
     off_x = (0.5 * (camera.width - 1) - camera.cx) / focal_px
     off_y = (0.5 * (camera.height - 1) - camera.cy) * camera.aspect / focal_px
-    seen = np.flatnonzero((np.abs(x - off_x * z) < half_x * z) & (np.abs(y - off_y * z) < half_y * z) & (faintest > V))
-    return near.take(seen), d_N.take(seen, axis=0), V.take(seen)
+    window = Window(R, (off_x - half_x, off_y - half_y), (off_x + half_x, off_y + half_y))
+    near = sky.around(R[2], math.atan(math.hypot(half_x, half_y)), window)
+    near = near[: near.searchsorted(sky.magnitude.searchsorted(faintest))]
+    return near, sky.directions.take(near, axis=0), sky.magnitude.take(near)
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ import numpy as np
 
 from ..attitude import quaternion_of_matrix
 from .catalog import load_catalog
-from .hypotheses import CHUNK, FIRST_CHUNK, Hypotheses, levels_for
-from .patterns import BRIGHT, BRIGHTEST, FAINT, LADDER, Sky
+from .hypotheses import CHUNK, FIRST_CHUNK, Hypotheses
+from .patterns import BRIGHT, BRIGHTEST, FAINT, Sky
 from .pinhole import Camera
 from .problem import Detections, Fit, Freedom, prepare
 from .screen import Raster, raster, screen
-from .stage import Stage, detection_pairs
+from .stage import stages
 from .verify import HOPELESS, jacobian, probability_false, turn, verify
 
 Status = Literal["solved", "too few stars", "no match", "uncertain"]
@@ -147,15 +147,13 @@ def search(sky: Sky, d: Detections, freedom: Freedom, fewest: int, limit: float,
     enough = min(limit, LIMIT)
     fits: list[Fit] = []
     done = 0
-    levels = levels_for(d, freedom, LADDER)
-    pairs = detection_pairs(d)
-    stages = [Stage(sky, n, d, pairs, levels, prior) for n, prior in DEPTHS if freedom.free or n != BRIGHTEST]
+    tables = stages(sky, d, freedom, [(n, prior) for n, prior in DEPTHS if freedom.free or n != BRIGHTEST])
     cells = raster(d)
     for worth in WORTH:
-        for stage in stages:
-            for k, looked, found in stage.hypotheses(worth, KEPT, min(max(done, FIRST_CHUNK), CHUNK)):
+        for stage in tables:
+            for looked, found in stage.hypotheses(worth, KEPT, min(max(done, FIRST_CHUNK), CHUNK)):
                 done += looked
-                if found is not None and weigh(sky, k, d, cells, found, freedom, fits, fewest, enough):
+                if found is not None and weigh(sky, stage.level, d, cells, found, freedom, fits, fewest, enough):
                     return fits, done
                 if done > work:
                     return fits, done

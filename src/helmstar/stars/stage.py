@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from .hypotheses import Hypotheses, hypotheses, spans, thinned
-from .patterns import SHORTEST, Sky
+from .hypotheses import Hypotheses, hypotheses, levels_for, spans, thinned
+from .patterns import LADDER, SHORTEST, Sky
 from .problem import Detections, Freedom
 
 FIELD_REACH = 0.70
@@ -19,9 +19,9 @@ SAMPLE = 40
 
 @dataclass
 class Stage:
-    """One depth of the pair tables, with what was tried of it: pairs[:begin] (m, 2) of the detections.
+    """One depth of one field's pair tables, with what was tried of it: pairs[:begin] (m, 2) of the detections.
 
-    levels: indices into the ladder with their share of the focal lengths; prior: how probable it is that this depth succeeds
+    level, part: index into the ladder, and its share of the focal lengths; prior: how probable it is that this table succeeds
     where the others fail; cost: catalogue pairs per detection pair.
     """
 
@@ -29,7 +29,8 @@ class Stage:
     n: int
     d: Detections
     pairs: np.ndarray
-    levels: list[tuple[int, Freedom]]
+    level: int
+    part: Freedom
     prior: float = 1.0
     begin: int = 0
     _cost: float | None = field(default=None, repr=False)
@@ -37,10 +38,9 @@ class Stage:
     @property
     def cost(self) -> float:
         if self._cost is None:
-            total = 0
-            for k, part in self.levels:
-                table = thinned(self.sky.level(k).pairs(self.n), self.sky.level(k).catalog.magnitude, self.d)
-                total += int(spans(table, self.d, self.pairs[:SAMPLE], part)[1].sum())
+            level = self.sky.level(self.level)
+            table = thinned(level.pairs(self.n), level.catalog.magnitude, self.d)
+            total = int(spans(table, self.d, self.pairs[:SAMPLE], self.part)[1].sum())
             # Without magnitudes each is laid both ways, which takes that much longer.
             self._cost = total / max(min(len(self.pairs), SAMPLE), 1) * (1.4 if self.d.magnitude is None else 1.0)
         return self._cost
@@ -56,16 +56,15 @@ class Stage:
         n = len(self.d)
         return round(len(self.pairs) * min(1.0, K * (K - 1.0) / (n * (n - 1.0)))) if K > 1.0 else 0
 
-    def hypotheses(self, worth: float, keep: int, chunk: int) -> Iterator[tuple[int, int, Hypotheses | None]]:
-        """Level, catalogue pairs looked at and ranked hypotheses, in chunks, of the pairs that are worth it and not yet tried."""
+    def hypotheses(self, worth: float, keep: int, chunk: int) -> Iterator[tuple[int, Hypotheses | None]]:
+        """Catalogue pairs looked at and ranked hypotheses, in chunks, of the pairs that are worth it and not yet tried."""
         end = self.worth_trying(worth)
         if end <= self.begin:
             return
         some, self.begin = self.pairs[self.begin : end], end
-        for k, part in self.levels:
-            for looked, found in hypotheses(self.sky.level(k), self.n, self.d, some, part, keep, chunk):
-                # Without magnitudes each catalogue pair is laid both ways.
-                yield k, looked if self.d.magnitude is not None else 2 * looked, found
+        for looked, found in hypotheses(self.sky.level(self.level), self.n, self.d, some, self.part, keep, chunk):
+            # Without magnitudes each catalogue pair is laid both ways.
+            yield looked if self.d.magnitude is not None else 2 * looked, found
 
 
 def detection_pairs(d: Detections) -> np.ndarray:
@@ -80,4 +79,23 @@ def detection_pairs(d: Detections) -> np.ndarray:
     return np.stack([i[order], j[order]], axis=1)
 
 
-__all__ = ["Stage", "detection_pairs"]
+def stages(sky: Sky, d: Detections, freedom: Freedom, depths: Sequence[tuple[int, float]]) -> list[Stage]:
+    """Of each depth (n stars per field, prior) the fields that the focal length allows, the widest first: their tables are small.
+
+    A table of its own for each: dense tables of narrow fields, a look into which costs with 1/field^2, must not keep those of wide
+    fields from being searched deeply. With priors as 1/field^2 all would be searched equally deep, with even ones the narrow fields
+    hardly; 1/field lies between.
+    """
+    pairs, levels = detection_pairs(d), levels_for(d, freedom, LADDER)
+    share = [1.0]
+    if len(levels) > 1:
+        width = np.array([np.log(part.f_high / part.f_low) / LADDER[level] for level, part in levels])
+        share = (width / width.sum()).tolist()
+    return [
+        Stage(sky, n, d, pairs, level, part, prior * own)
+        for n, prior in depths
+        for (level, part), own in reversed(list(zip(levels, share)))
+    ]
+
+
+__all__ = ["Stage", "detection_pairs", "stages"]
