@@ -15,10 +15,10 @@ from dataclasses import replace
 import numpy as np
 
 from ..imaging import Camera, Centroids
-from ..stars.identify import matrix_of_quaternion
+from ..stars.identify import Identification, matrix_of_quaternion
 from ..stars.patterns import Sky
 from ..stars.verify import turn
-from .lens import Lens, LensPrior
+from .lens import PARAMETERS, Lens, LensPrior
 from .refine import ASTRAY, BENT_PX, HUBER, Refined, turned
 
 EXPECTED = 0.0015
@@ -30,6 +30,8 @@ REACH = 0.35
 """L, over the image's width."""
 MOST = 150
 """Stars, the brightest: the cost goes with their cube."""
+BELIEF = 2.0
+"""Coordinates that what is believed of a displacement is worth."""
 STEPS = 8
 """At most, of Gauss and Newton."""
 
@@ -133,4 +135,20 @@ def _kriged(
     return float(log), np.concatenate([delta, field]), covariance
 
 
-__all__ = ["displaced"]
+def displaced_px(fit: Refined, believed_px: float) -> float:
+    """By how much, 1 sigma per axis, a fit's stars are displaced: its residuals, of the freedom that the parameters left, and
+    what was believed before, as worth as `BELIEF` coordinates; no more than that."""
+    i = fit.identification
+    chi2 = 2.0 * len(i.stars) * (i.residual_rms * fit.camera.focal_px) ** 2
+    free = max(2.0 * len(i.stars) - PARAMETERS, 0.0)
+    return min(believed_px, math.sqrt((BELIEF * believed_px**2 + chi2) / (BELIEF + free)))
+
+
+def smoothly(found: Identification, sigma_px: float, camera: Camera) -> Identification:
+    """With what moves all stars alike, and more of them do not average, in the covariance: 1 sigma per axis."""
+    sigma = sigma_px / camera.focal_px
+    spread = math.hypot(camera.width, camera.height * camera.aspect) / math.sqrt(12.0) / camera.focal_px
+    return replace(found, covariance=found.covariance + sigma**2 * np.diag([1.0, 1.0, spread**-2]))
+
+
+__all__ = ["displaced", "displaced_px", "smoothly"]

@@ -21,16 +21,17 @@ import numpy as np
 
 from ..imaging import Camera, Centroids, DetectionSettings, Image
 from ..imaging.calibrated import Calibrated
+from ..imaging.coarser import detect_coarser
 from ..imaging.detect import Optics, detect_near, detect_next
 from ..stars.catalog import Catalog, load_catalog
-from ..stars.doubt import ROUGH_WIDTHS, Doubt, identify_uncalibrated, magnitude_of_order, roughened
+from ..stars.doubt import ODDS, ROUGH_WIDTHS, Doubt, identify_uncalibrated, magnitude_of_order, roughened
 from ..stars.glance import follow, glance
 from ..stars.identify import LIMIT, Identification, identify, matrix_of_quaternion, unit_quaternion
 from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
 from ..stars.track import WIDEST_PX, track
-from .displaced import displaced
-from .lens import PARAMETERS, LensPrior
+from .displaced import displaced, displaced_px, smoothly
+from .lens import LensPrior
 from .refine import EPOCH_SPREAD_YEARS, Refined, refine
 
 FOCAL_SIGMA = 0.005
@@ -43,8 +44,12 @@ ROUGH_STRAIN = 2.5
 """Sigmas of the usual lens's prior from which its centre or k1 is not that of a usual lens."""
 BRIGHTEST, BRIGHT_SHARE = 12, 0.75
 """Of so many detections, the brightest, a fit that is beyond doubt explains this share."""
-BELIEF = 2.0
-"""Coordinates that what is believed of a rough lens is worth."""
+COARSER = (2, 4, 8)
+"""Pixels whose means are tried, along a side, where an image is not solved."""
+TRAILED = 2.0
+"""Median of the stars' elongation from which an attitude may be that of ends of trails: means are tried then too."""
+MORE, FEWEST_MORE = 1.5, 8
+"""Factor and number of detections from which means of pixels show more than the pixels did."""
 TRACKED = 50
 """Stars whose windows are looked at in tracking."""
 AU_DAY = 149597870700.0 / 86400.0
@@ -56,7 +61,8 @@ class StarSolution:
     """What became of an image. camera: with the focal length and k1 that were found; ms: milliseconds by stage; ra_deg, dec_deg:
     the direction at the image's geometric centre, roll_deg: north's angle from image up there, counter-clockwise; NaN
     where it is not solved. sigma_arcsec (3,): about x, y and z of S. scale: factor on the centroids' sigmas that the residuals
-    show and that the covariance holds. doubt: what had to be doubted for it (`stars.doubt`)."""
+    show and that the covariance holds. doubt: what had to be doubted for it (`stars.doubt`). averaged_px: side of the squares of
+    pixels whose means showed the stars, 1 where the pixels did."""
 
     identification: Identification
     centroids: Centroids
@@ -68,6 +74,7 @@ class StarSolution:
     ms: dict[str, float]
     scale: float = 1.0
     doubt: Doubt = ""
+    averaged_px: int = 1
 
     @property
     def status(self) -> str:
@@ -168,6 +175,23 @@ class StarTracker:
                 ms = {"detect": ms["detect"] + 1e3 * (time.perf_counter() - again)}
                 found = self.identified(centroids, *size, prior_q_SN, prior_sigma, ms)
         self.memory = Memory(size, optics, found.camera if found.solved else None)
+        trailed = len(centroids) > 0 and float(np.median(centroids.elongation)) > TRAILED
+        return self._coarser(image, found, dark) if trailed or not found.solved else found
+
+    def _coarser(self, image: Image, found: StarSolution, dark: np.ndarray | None) -> StarSolution:
+        """From means of pixels, where they show more stars than the pixels did: smeared and badly focused ones; the means of most
+        stars first, at odds against each. The covariance holds a streak's width and length. Otherwise what was found."""
+        sceptic, begin = copy(self), time.perf_counter()
+        seen = [(step, c) for step in COARSER if (c := detect_coarser(image, step, self.detection, dark)) is not None]
+        least = max(MORE * len(found.centroids), FEWEST_MORE)
+        for step, centroids in sorted((s for s in seen if len(s[1]) >= least), key=lambda s: -len(s[1])):
+            sceptic.limit /= ODDS
+            ms = {"detect": found.ms["total"] + 1e3 * (time.perf_counter() - begin)}
+            other = sceptic.identified(centroids, image.width, image.height, ms=ms)
+            if other.solved:
+                long_px = step * float(np.median(centroids.elongation[other.identification.detections]))
+                i = smoothly(other.identification, long_px, other.camera)
+                return _solution(i, centroids, other.camera, other.ms, other.scale, other.doubt, step)
         return found
 
     def _in_windows(
@@ -247,7 +271,8 @@ class StarTracker:
         if self.known is not None:
             lens = LensPrior.calibrated(self.known)
             fit = refine(found, centroids, camera, self.sky, lens, self.epoch_years)
-            return _smooth(fit, self.known.smooth_px, camera), doubt
+            i = smoothly(fit.identification, self.known.smooth_px, fit.camera)
+            return replace(fit, identification=i), doubt
         if "field" in doubt:  # the fit must not lean on a statement that was wrong
             focal_sigma = math.inf
         first, floor = None, ROUGH_WIDTHS * camera.width
@@ -258,14 +283,14 @@ class StarTracker:
             if first.scale < ROUGH_SCALE and first.strain < ROUGH_STRAIN and plain:
                 return first, doubt
             if plain:
-                floor = _displaced_px(first, floor)
+                floor = displaced_px(first, floor)
         lens, magnitude = LensPrior.rough(camera, focal_sigma), magnitude_of_order(centroids.flux)
         rough = None
         for _ in range(2):  # the second time with what the stars are displaced by indeed
             C = roughened(centroids.covariance_px, len(centroids), floor)
             places = replace(centroids, covariance_px=C)
             rough = refine(found, places, camera, self.sky, lens, self.epoch_years, magnitude)
-            floor = _displaced_px(rough, floor)
+            floor = displaced_px(rough, floor)
         assert rough is not None
         if first is not None:
             told, more = len(first.identification.stars), len(rough.identification.stars)
@@ -302,27 +327,10 @@ class StarTracker:
 _of_field = cache(Camera.from_fov)
 
 
-def _displaced_px(fit: Refined, believed_px: float) -> float:
-    """By how much, 1 sigma per axis, a fit's stars are displaced: its residuals, of the freedom that the parameters left, and
-    what was believed before, as worth as `BELIEF` coordinates; no more than that."""
-    i = fit.identification
-    chi2 = 2.0 * len(i.stars) * (i.residual_rms * fit.camera.focal_px) ** 2
-    free = max(2.0 * len(i.stars) - PARAMETERS, 0.0)
-    return min(believed_px, math.sqrt((BELIEF * believed_px**2 + chi2) / (BELIEF + free)))
-
-
 def _bright_share(fit: Refined, centroids: Centroids) -> float:
     """Share of the brightest detections that a fit explains: the flux comes sorted."""
     count = min(len(centroids), BRIGHTEST)
     return np.count_nonzero(fit.identification.detections < count) / max(count, 1)
-
-
-def _smooth(fit: Refined, sigma_px: float, camera: Camera) -> Refined:
-    """With what a lens's displacement does to all stars together, which more stars do not average: 1 sigma per axis."""
-    i = fit.identification
-    sigma = sigma_px / fit.camera.focal_px
-    spread = math.hypot(camera.width, camera.height * camera.aspect) / math.sqrt(12.0) / fit.camera.focal_px
-    return replace(fit, identification=replace(i, covariance=i.covariance + sigma**2 * np.diag([1.0, 1.0, spread**-2])))
 
 
 def observer(julian_date_tt: float) -> tuple[float, np.ndarray]:
@@ -352,14 +360,14 @@ def _sky(year: float, velocity_c: tuple[float, ...] | None, position_au: tuple[f
 
 def _solution(
     found: Identification, centroids: Centroids, camera: Camera, ms: dict[str, float], scale: float,
-    doubt: Doubt,
+    doubt: Doubt, averaged_px: int = 1,
 ) -> StarSolution:  # fmt: skip
     nan = float("nan")
     if not found.solved:
         return StarSolution(found, centroids, camera, nan, nan, nan, np.full(3, nan), ms, doubt=doubt)
     ra, dec, roll = centre_angles(camera, matrix_of_quaternion(found.q_SN))
     sigma = np.degrees(np.sqrt(np.diagonal(found.covariance))) * 3600.0
-    return StarSolution(found, centroids, camera, ra, dec, roll, sigma, ms, scale, doubt)
+    return StarSolution(found, centroids, camera, ra, dec, roll, sigma, ms, scale, doubt, averaged_px)
 
 
 def centre_angles(camera: Camera, R_SN: np.ndarray) -> tuple[float, float, float]:

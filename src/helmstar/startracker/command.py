@@ -175,8 +175,14 @@ def entry_of(file: Path, found: StarSolution) -> dict[str, Any]:
         "stars": len(i.stars),
         "residual_rms_arcsec": float(i.residual_rms * ARCSEC_RAD),
         "hip": [int(v) for v in i.hip],
-        "message": DOUBTED[found.doubt],
+        "message": _doubted(found),
     }
+
+
+def _doubted(found: StarSolution) -> str:
+    side = found.averaged_px
+    smeared = f"solved on means of {side} x {side} pixels: the stars are smeared or badly focused" if side > 1 else ""
+    return "; ".join(text for text in (DOUBTED[found.doubt], smeared) if text)
 
 
 DOUBTED = {
@@ -188,7 +194,8 @@ DOUBTED = {
 REASON = {
     "solved": "",
     "too few stars": "fewer than three stars were detected; expose longer, or focus",
-    "no match": "no attitude explains the detections better than chance; give a range as --fov, and no mirrored image",
+    "no match": "no attitude explains the detections better than chance; give a range as --fov, --pixel-aspect "
+    "where pixels are not square, and no mirrored image",
     "uncertain": "the best attitude is more probably false than --max-false allows; give an image of more stars",
 }
 
