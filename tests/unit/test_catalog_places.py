@@ -12,7 +12,7 @@ import pytest
 
 from helmstar.cli import main
 from helmstar.errors import ConfigurationError, DataError
-from helmstar.sensors.star_tracker import observer_place
+from helmstar.sensors.observer import observer_place
 from helmstar.stars import catalog as catalogs
 from helmstar.stars.catalog import EPOCH_YEAR, GAIA_YEAR, MAS, load_catalog, load_gaia, read_gaia
 

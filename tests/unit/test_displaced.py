@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 from helmstar.imaging import Camera, Centroids
 from helmstar.sensors.displaced import _kriged, displaced
-from helmstar.sensors.lens import LensPrior
+from helmstar.sensors.lens import Lens, LensPrior
 from helmstar.sensors.refine import Refined, refine
 from helmstar.stars.doubt import roughened
 from helmstar.stars.identify import Identification, default_sky
@@ -20,37 +20,43 @@ CAMERA = Camera.from_fov(16.0, 1024, 768)
 NOISE = 0.1
 
 
-def wave(xy: np.ndarray, px: float, phase: float) -> np.ndarray:
-    """Of about one period over the image, `px` root mean square per axis."""
-    u, v = ((xy - [CAMERA.cx, CAMERA.cy]) / CAMERA.width).T
-    return px * np.sqrt(2.0) * np.stack([np.sin(6.0 * v + 2.0 * u + phase), np.cos(5.0 * u + 2.0 * phase)], axis=1)
+def wave(xy: np.ndarray, px: float, phase: float, camera: Camera = CAMERA) -> np.ndarray:
+    """Of about one period over the image, `px` pixel widths root mean square per axis."""
+    square = np.array([1.0, camera.aspect])
+    u, v = ((xy - [camera.cx, camera.cy]) * square / camera.width).T
+    return (
+        px
+        * np.sqrt(2.0)
+        * np.stack([np.sin(6.0 * v + 2.0 * u + phase), np.cos(5.0 * u + 2.0 * phase)], axis=1)
+        / square
+    )
 
 
-def frame(seed: int, px: float, stars: int = 60) -> tuple[Refined, Centroids, np.ndarray]:
+def frame(seed: int, px: float, stars: int = 60, camera: Camera = CAMERA) -> tuple[Refined, Centroids, np.ndarray]:
     """A rough fit, the centroids it is of, and R (3, 3) whose z axis is what the middle of the image truly sees."""
     rng = np.random.default_rng(seed)
     sky, R, phase = default_sky(), Rotation.random(rng=rng).as_matrix(), rng.uniform(0.0, 6.0)
     ahead = np.flatnonzero(sky.directions @ R[2] > 0.95)
-    xy = CAMERA.pixels(sky.directions[ahead] @ R.T)
-    inside = np.flatnonzero(CAMERA.inside(xy))[:stars]
+    xy = camera.pixels(sky.directions[ahead] @ R.T)
+    inside = np.flatnonzero(camera.inside(xy))[:stars]
     at, xy = ahead[inside], xy[inside]
-    seen = xy + wave(xy, px, phase) + rng.normal(0.0, NOISE, xy.shape)
+    seen = xy + wave(xy, px, phase, camera) + rng.normal(0.0, NOISE, xy.shape) / [1.0, camera.aspect]
     n, one = len(at), np.ones(len(at))
-    C = np.tile(NOISE**2 * np.eye(2), (n, 1, 1))
+    C = np.tile(NOISE**2 * np.diag([1.0, camera.aspect**-2]), (n, 1, 1))
     centroids = Centroids(seen[:, 0], seen[:, 1], 10 ** (-0.4 * sky.magnitude[at]), C, one, one < 0, one, 50 * one)
     q = Rotation.from_matrix(R).as_quat()
     found = Identification(
         "solved", q, q, np.eye(3), 0.0, 0.0, 0.0, np.arange(n), at, sky.catalog.hip[at], np.zeros((n, 2)), 0.0,
-        CAMERA.focal_px, 0.0, 0.0, 0.0, 0,
+        camera.focal_px, 0.0, 0.0, 0.0, 0,
     )  # fmt: skip
-    lens = LensPrior.rough(CAMERA, 0.005)
-    rough = refine(found, replace(centroids, covariance_px=roughened(C, n, max(px, 0.1))), CAMERA, sky, lens)
+    lens = LensPrior.rough(camera, 0.005)
+    rough = refine(found, replace(centroids, covariance_px=roughened(C, n, max(px, 0.1))), camera, sky, lens)
     # The middle sees what lies where the wave brings it there.
-    middle = np.array([[CAMERA.cx, CAMERA.cy]])
+    middle = np.array([[camera.cx, camera.cy]])
     place = middle
     for _ in range(50):
-        place = middle - wave(place, px, phase)
-    d = CAMERA.directions(place)[0]
+        place = middle - wave(place, px, phase, camera)
+    d = camera.directions(place)[0]
     turn = Rotation.from_rotvec(np.cross(d, [0.0, 0.0, 1.0]))  # a small angle: its sine is the angle to 1e-8
     return rough, centroids, turn.as_matrix() @ R
 
@@ -60,16 +66,19 @@ def off(fit: Refined, R: np.ndarray) -> np.ndarray:
     return (Rotation.from_quat(fit.identification.q_SN) * Rotation.from_matrix(R).inv()).as_rotvec()[:2]
 
 
-def solved(fit: Refined, centroids: Centroids) -> Refined:
-    return displaced(fit, centroids, CAMERA, default_sky(), LensPrior.rough(CAMERA, 0.005))
+def solved(fit: Refined, centroids: Centroids, camera: Camera = CAMERA) -> Refined:
+    return displaced(fit, centroids, camera, default_sky(), LensPrior.rough(camera, 0.005))
 
 
-@pytest.mark.parametrize("px", [0.5, 3.0])
-def test_attitudes_come_nearer_and_covariances_hold(px):
+TALL = Camera(1024, 450, CAMERA.focal_px, (590.0, 190.0), 1.7)
+
+
+@pytest.mark.parametrize(("px", "camera"), [(0.5, CAMERA), (3.0, CAMERA), (3.0, TALL)], ids=["0.5", "3", "tall pixels"])
+def test_attitudes_come_nearer_and_covariances_hold(px, camera):
     before, after, squares = [], [], []
     for seed in range(24):
-        rough, centroids, R = frame(seed, px)
-        better = solved(rough, centroids)
+        rough, centroids, R = frame(seed, px, camera=camera)
+        better = solved(rough, centroids, camera)
         e = off(better, R)
         before.append(float(off(rough, R) @ off(rough, R)))
         after.append(float(e @ e))
@@ -99,7 +108,9 @@ def test_few_stars_keep_the_doubt():
     few = solved(rough, centroids).identification.covariance
     assert few[0, 0] > 4.0 * many[0, 0]
     two = replace(rough, identification=replace(rough.identification, stars=rough.identification.stars[:2]))
-    assert solved(two, centroids) is two
+    kept = solved(two, centroids).identification
+    assert np.array_equal(kept.q_SN, two.identification.q_SN)
+    assert kept.covariance[0, 0] > two.identification.covariance[0, 0] + (1.0 / CAMERA.focal_px) ** 2
 
 
 def test_a_mounting_is_kept():
@@ -109,6 +120,18 @@ def test_a_mounting_is_kept():
     better = solved(replace(rough, identification=replace(i, q_BN=q_BN)), centroids).identification
     back = Rotation.from_quat(better.q_BN) * Rotation.from_quat(better.q_SN).inv() * mounting.inv()
     assert back.magnitude() < 1e-12
+
+
+@pytest.mark.parametrize("camera", [CAMERA, TALL], ids=["square", "tall pixels"])
+def test_what_is_seen_at_the_centre_is_so_for_lenses_far_out(camera):
+    lens = Lens.of(camera, LensPrior.rough(camera, 0.005))
+    rng = np.random.default_rng(4)
+    for _ in range(10):
+        p = rng.normal(size=6) * [0.1, *1.5 / np.sqrt(lens.known[4:])]
+        x, y = lens.seen_at_centre(p)
+        seen = lens.predict(np.eye(3), p, np.array([[x, y, 1.0]]))[0][0]
+        # Newton's method to 1e-13, times a focal length of some thousand pixels.
+        assert np.allclose(seen, [camera.cx, camera.cy], atol=1e-8)
 
 
 def test_kriging_is_the_conditional_of_a_joint_gaussian():

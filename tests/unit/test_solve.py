@@ -16,7 +16,8 @@ from helmstar.cli import main
 from helmstar.imaging import Camera
 from helmstar.imaging.render import render
 from helmstar.io.images import read_image
-from helmstar.sensors.star_tracker import centre_angles, observer
+from helmstar.sensors.observer import observer
+from helmstar.sensors.star_tracker import centre_angles
 from helmstar.stars import load_catalog
 from helmstar.startracker.command import SolveOptions, tracker_of
 

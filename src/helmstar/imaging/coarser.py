@@ -10,6 +10,10 @@ from .detect import detect
 from .frame import Centroids, Image
 from .settings import DetectionSettings
 
+STEPS = (2, 4, 8)
+"""Pixels, along a side, whose means are looked at."""
+MORE, FEWEST_MORE = 1.5, 8
+"""Factor and number of detections from which means of pixels show more than the pixels did."""
 LEAST_SIDE = 100
 """Pixels that the shorter side must keep."""
 
@@ -28,9 +32,10 @@ def detect_coarser(
     for y in range(step):
         for x in range(step):
             part = np.s_[y : y + rows * step : step, x : x + columns * step : step]
-            array += image.array[part]
-            if dark is not None:
-                array -= dark[part]
+            with np.errstate(invalid="ignore"):  # infinities of both signs: no number, which is no star
+                array += image.array[part]
+                if dark is not None:
+                    array -= dark[part]
     found = detect(replace(image, array=array / np.float32(step * step)), settings)
     return replace(
         found, x_px=(found.x_px + 0.5) * step - 0.5, y_px=(found.y_px + 0.5) * step - 0.5,
@@ -38,4 +43,12 @@ def detect_coarser(
     )  # fmt: skip
 
 
-__all__ = ["detect_coarser"]
+def showing_more(
+    image: Image, count: int, settings: DetectionSettings | None = None, dark: np.ndarray | None = None
+) -> list[tuple[int, Centroids]]:
+    """Steps, and what their means show, where that is more than the `count` detections of the pixels; the most first."""
+    seen = [(step, found) for step in STEPS if (found := detect_coarser(image, step, settings, dark)) is not None]
+    return sorted((s for s in seen if len(s[1]) >= max(MORE * count, FEWEST_MORE)), key=lambda s: -len(s[1]))
+
+
+__all__ = ["detect_coarser", "showing_more"]

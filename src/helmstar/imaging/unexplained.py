@@ -39,7 +39,7 @@ def shared_px(frames: Sequence[Matches], fit: Calibration) -> float:
         spans.append(np.linalg.qr(turns.reshape(-1, 3))[0])
     weight = [np.repeat(1.0 / s, 2) for s in sigma]
     y = _beside([(e.ravel() * w)[:, None] for e, w in zip(error, weight)], spans)[:, 0]
-    A = _beside([b.reshape(-1, len(names)) * w[:, None] for b, w in zip(lens, weight)], spans)
+    A = _beside([b.reshape(2 * len(b), len(names)) * w[:, None] for b, w in zip(lens, weight)], spans)
     left = len(y) - 3 * len(spans)
     before, rank = _leftover(A, y)
     for order in ORDERS:

@@ -18,7 +18,7 @@ from ..imaging import Camera, Centroids
 from ..stars.identify import Identification, matrix_of_quaternion
 from ..stars.patterns import Sky
 from ..stars.verify import turn
-from .lens import PARAMETERS, Lens, LensPrior
+from .lens import PARAMETERS, Lens, LensPrior, turn_to
 from .refine import ASTRAY, BENT_PX, HUBER, Refined, turned
 
 EXPECTED = 0.0015
@@ -39,29 +39,34 @@ STEPS = 8
 def displaced(fit: Refined, centroids: Centroids, camera: Camera, sky: Sky, prior: LensPrior) -> Refined:
     """The fit with attitude, lens and covariance that a smooth displacement leaves. prior: of the lens, as the fit had it.
 
-    Fits of fewer than three stars, and those that run away, come back as they are.
+    Fits of fewer than three stars, and those that run away, come back with what is expected of a displacement in the covariance.
     """
     i = fit.identification
     stars, detections = i.stars[:MOST], i.detections[:MOST]
+    doubted = replace(fit, identification=smoothly(i, EXPECTED * camera.width, fit.camera))
     if len(stars) < 3:
-        return fit
+        return doubted
     xy, C, d_N = centroids.xy_px[detections], centroids.covariance_px[detections], sky.directions[stars]
     variance = 0.5 * (C[:, 0, 0] + C[:, 1, 1] * camera.aspect**2)
     R, p, lens = matrix_of_quaternion(i.q_SN), fit.lens, Lens.of(camera, prior)
     for _ in range(STEPS):
         mean, P = _step(lens, R, p, d_N, xy, variance)
         if not (np.isfinite(mean).all() and abs(p[0] + mean[3] - fit.lens[0]) < math.log(ASTRAY)):
-            return fit
+            return doubted
         R, p = turn(mean[:3], R), p + mean[3:9]
         if lens.second_order(mean[:9]) < BENT_PX:
             break
-    # A place that is displaced by g in the middle is seen there from a direction turned by this.
-    fitted = lens.fitted(p)
-    T = np.concatenate([np.eye(3, 9), np.array([[0.0, -1.0], [1.0, 0.0], [0.0, 0.0]]) / fitted.focal_px], axis=1)
+    fitted, seen = lens.fitted(p), lens.seen_at_centre(p)
+    # z is turned to what the lens sees at the centre, and to what the field displaces to there.
+    lean = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
+    sizes = 1e-3 / np.sqrt(np.maximum(lens.known[3:], 1.0))
+    slopes = np.stack([(lens.seen_at_centre(p + step) - seen) / step.sum() for step in np.diag(sizes)], axis=1)
+    T = np.concatenate([np.eye(3), lean @ slopes, -lean / fitted.focal_px], axis=1)
+    R_SN = turn(T[:, 9:] @ mean[9:], turn_to(*seen).T @ R)
     residual = centroids.xy_px[i.detections] - lens.predict(R, p, sky.directions[i.stars])[0]
     residual[:, 1] *= camera.aspect
     found = replace(
-        turned(i, turn(T[:, 9:] @ mean[9:], R), T @ P @ T.T), residuals_px=residual, focal_px=fitted.focal_px,
+        turned(i, R_SN, T @ P @ T.T), residuals_px=residual, focal_px=fitted.focal_px,
         residual_rms=math.sqrt(float(np.square(residual).mean())) / fitted.focal_px,
     )  # fmt: skip
     return replace(fit, identification=found, camera=fitted, lens=p)

@@ -112,7 +112,7 @@ class Lens:
         sx, sy = -ex / f, -a * ey / f
         r2 = sx * sx + sy * sy
         sx, sy = sx / (1.0 + k1 * r2), sy / (1.0 + k1 * r2)
-        T = _turn_to(sx, sy)
+        T = turn_to(sx, sy)
         v = d_N @ (T @ R).T
         x, y = v[:, 0] / v[:, 2], v[:, 1] / v[:, 2]
         xy = x * y
@@ -141,6 +141,17 @@ class Lens:
         J[:, 0, 8], J[:, 1, 8] = f * (r2 + 2.0 * x * x), 2.0 * f / a * xy
         return np.stack([c.cx + ex + f * xd, c.cy + ey + f / a * yd], axis=1), J
 
+    def seen_at_centre(self, p: np.ndarray) -> np.ndarray:
+        """X/Z and Y/Z (2,) in S of what is seen at the stated centre: zero but for what `predict` leaves of third order."""
+        at = np.zeros(2)
+        for _ in range(8):
+            off = self.predict(np.eye(3), p, np.array([[*at, 1.0]]))[0][0] - [self.camera.cx, self.camera.cy]
+            step = off * [1.0, self.camera.aspect] / (self.camera.focal_px * math.exp(p[0]))
+            at = at - step
+            if abs(step).max() < 1e-13:
+                break
+        return at
+
     def fitted(self, p: np.ndarray) -> Camera:
         """The camera of p's focal length, and k1, p1, p2 added to its own: what of it folds no corner over, where no star was
         seen."""
@@ -164,7 +175,7 @@ class Lens:
         return self.known, -self.known * np.concatenate([np.zeros(3), p])
 
 
-def _turn_to(x: float, y: float) -> np.ndarray:
+def turn_to(x: float, y: float) -> np.ndarray:
     """The least turn (3, 3) that takes z to the direction of [x, y, 1]."""
     length = np.sqrt(x * x + y * y + 1.0)
     a, b, c = x / length, y / length, 1.0 / length
@@ -172,4 +183,4 @@ def _turn_to(x: float, y: float) -> np.ndarray:
     return np.array([[1.0 - k * a * a, -k * a * b, a], [-k * a * b, 1.0 - k * b * b, b], [-a, -b, c]])
 
 
-__all__ = ["Lens", "LensPrior", "lens_sigmas"]
+__all__ = ["PARAMETERS", "Lens", "LensPrior", "lens_sigmas", "turn_to"]

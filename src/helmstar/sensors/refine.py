@@ -133,7 +133,8 @@ def _in_view(
     off_x = (0.5 * (camera.width - 1) - camera.cx) / focal_px
     off_y = (0.5 * (camera.height - 1) - camera.cy) * camera.aspect / focal_px
     window = Window(R, (off_x - half_x, off_y - half_y), (off_x + half_x, off_y + half_y))
-    near = sky.around(R[2], math.atan(math.hypot(half_x, half_y)), window)
+    axis = R.T @ np.array([off_x, off_y, 1.0])
+    near = sky.around(axis / math.sqrt(axis @ axis), math.atan(math.hypot(half_x, half_y)), window)
     near = near[: near.searchsorted(sky.magnitude.searchsorted(faintest))]
     return near, sky.directions.take(near, axis=0), sky.magnitude.take(near)
 

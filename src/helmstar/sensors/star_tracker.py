@@ -21,12 +21,21 @@ import numpy as np
 
 from ..imaging import Camera, Centroids, DetectionSettings, Image
 from ..imaging.calibrated import Calibrated
-from ..imaging.coarser import detect_coarser
+from ..imaging.coarser import showing_more
 from ..imaging.detect import Optics, detect_near, detect_next
 from ..stars.catalog import Catalog, load_catalog
-from ..stars.doubt import ODDS, ROUGH_WIDTHS, Doubt, identify_uncalibrated, magnitude_of_order, roughened
+from ..stars.doubt import (
+    ODDS,
+    ROUGH_WIDTHS,
+    ROUGH_WORK,
+    Doubt,
+    against,
+    identify_uncalibrated,
+    magnitude_of_order,
+    roughened,
+)
 from ..stars.glance import follow, glance
-from ..stars.identify import LIMIT, Identification, identify, matrix_of_quaternion, unit_quaternion
+from ..stars.identify import LIMIT, WORK, Identification, identify, matrix_of_quaternion, unit_quaternion
 from ..stars.patterns import Sky
 from ..stars.pinhole import Pinhole
 from ..stars.track import WIDEST_PX, track
@@ -41,25 +50,21 @@ CALIBRATED_SIGMA = 0.0005
 ROUGH_SCALE = 1.5
 """Factor on the centroids' sigmas from which a fit says that the lens displaces stars, not noise."""
 ROUGH_STRAIN = 2.5
-"""Sigmas of the usual lens's prior from which its centre or k1 is not that of a usual lens."""
+"""Sigmas of the usual lens's prior from which its centre, k1, p1 or p2 is not that of a usual lens."""
 BRIGHTEST, BRIGHT_SHARE = 12, 0.75
 """Of so many detections, the brightest, a fit that is beyond doubt explains this share."""
-COARSER = (2, 4, 8)
-"""Pixels whose means are tried, along a side, where an image is not solved."""
+COARSER_TRIED = 2
+"""Means of pixels that are tried where an image is not solved."""
 TRAILED = 2.0
 """Median of the stars' elongation from which an attitude may be that of ends of trails: means are tried then too."""
-MORE, FEWEST_MORE = 1.5, 8
-"""Factor and number of detections from which means of pixels show more than the pixels did."""
 TRACKED = 50
 """Stars whose windows are looked at in tracking."""
-AU_DAY = 149597870700.0 / 86400.0
-LIGHT = 299792458.0
 
 
 @dataclass(frozen=True)
 class StarSolution:
-    """What became of an image. camera: with the focal length and k1 that were found; ms: milliseconds by stage; ra_deg, dec_deg:
-    the direction at the image's geometric centre, roll_deg: north's angle from image up there, counter-clockwise; NaN
+    """What became of an image. camera: with the focal length, k1, p1 and p2 found; ms: milliseconds by stage; ra_deg, dec_deg: the
+    direction at the image's geometric centre, roll_deg: north's angle from image up there, counter-clockwise; NaN
     where it is not solved. sigma_arcsec (3,): about x, y and z of S. scale: factor on the centroids' sigmas that the residuals
     show and that the covariance holds. doubt: what had to be doubted for it (`stars.doubt`). averaged_px: side of the squares of
     pixels whose means showed the stars, 1 where the pixels did."""
@@ -180,19 +185,24 @@ class StarTracker:
 
     def _coarser(self, image: Image, found: StarSolution, dark: np.ndarray | None) -> StarSolution:
         """From means of pixels, where they show more stars than the pixels did: smeared and badly focused ones; the means of most
-        stars first, at odds against each. The covariance holds a streak's width and length. Otherwise what was found."""
-        sceptic, begin = copy(self), time.perf_counter()
-        seen = [(step, c) for step in COARSER if (c := detect_coarser(image, step, self.detection, dark)) is not None]
-        least = max(MORE * len(found.centroids), FEWEST_MORE)
-        for step, centroids in sorted((s for s in seen if len(s[1]) >= least), key=lambda s: -len(s[1])):
+        stars first, at odds against each and with little work. The covariance holds half a streak or more, by its elongation.
+        Otherwise what was found, with the work and the time."""
+        sceptic, begin, work = copy(self), time.perf_counter(), found.identification.work
+        likely = showing_more(image, len(found.centroids), self.detection, dark)[:COARSER_TRIED]
+        answer = found
+        for tried, (step, centroids) in enumerate(likely, start=1):
             sceptic.limit /= ODDS
-            ms = {"detect": found.ms["total"] + 1e3 * (time.perf_counter() - begin)}
-            other = sceptic.identified(centroids, image.width, image.height, ms=ms)
+            other = sceptic.identified(centroids, image.width, image.height, work=ROUGH_WORK)
+            i = against(other.identification, tried, work)
+            work = i.work
             if other.solved:
-                long_px = step * float(np.median(centroids.elongation[other.identification.detections]))
-                i = smoothly(other.identification, long_px, other.camera)
-                return _solution(i, centroids, other.camera, other.ms, other.scale, other.doubt, step)
-        return found
+                long_px = step * float(np.median(centroids.elongation[i.detections]))
+                i = smoothly(i, long_px, other.camera)
+                answer = _solution(i, centroids, other.camera, {}, other.scale, other.doubt, step)
+                break
+        spent = 1e3 * (time.perf_counter() - begin)
+        ms = {**found.ms, "coarser": spent, "total": found.ms["total"] + spent}
+        return replace(answer, identification=replace(answer.identification, work=work), ms=ms)
 
     def _in_windows(
         self, image: Image, prior_q_SN: np.ndarray, prior_sigma: float, last: Memory, dark: np.ndarray | None
@@ -214,10 +224,10 @@ class StarTracker:
 
     def identified(
         self, centroids: Centroids, width: int, height: int, prior_q_SN: np.ndarray | None = None,
-        prior_sigma: float | None = None, ms: dict[str, float] | None = None, fall_back: bool = True,
+        prior_sigma: float | None = None, ms: dict[str, float] | None = None, fall_back: bool = True, work: int = WORK,
     ) -> StarSolution:  # fmt: skip
         """As `solve`, from the stars that were detected. ms: milliseconds of what went before; fall_back: whether the whole sky is
-        searched where tracking fails."""
+        searched where tracking fails; work: as for `identify`."""
         begin = time.perf_counter()
         centroids = self._honest(centroids)
         camera, fov_range, focal_sigma = self._optics(width, height)
@@ -245,9 +255,9 @@ class StarTracker:
             if not found.solved and fall_back and not calibrated:
                 found = None
         if found is None and self.camera is not None:
-            found = identify(centroids.xy_px + 0.5, eye, **stars)
+            found = identify(centroids.xy_px + 0.5, eye, work=work, **stars)
         elif found is None:
-            found, doubt = identify_uncalibrated(centroids.xy_px + 0.5, eye, fov_range=fov_range, **stars)
+            found, doubt = identify_uncalibrated(centroids.xy_px + 0.5, eye, fov_range=fov_range, work=work, **stars)
         done = time.perf_counter()
         scale = 1.0
         if found.solved:
@@ -273,18 +283,19 @@ class StarTracker:
             fit = refine(found, centroids, camera, self.sky, lens, self.epoch_years)
             i = smoothly(fit.identification, self.known.smooth_px, fit.camera)
             return replace(fit, identification=i), doubt
+        near = replace(camera, focal_px=found.focal_px)  # what a lens may be is told at the corner of its field
         if "field" in doubt:  # the fit must not lean on a statement that was wrong
             focal_sigma = math.inf
         first, floor = None, ROUGH_WIDTHS * camera.width
         if doubt != "rough":
-            lens = LensPrior.uncalibrated(camera, focal_sigma)
+            lens = LensPrior.uncalibrated(near, focal_sigma)
             first = refine(found, centroids, camera, self.sky, lens, self.epoch_years)
             plain = _bright_share(first, centroids) >= BRIGHT_SHARE
             if first.scale < ROUGH_SCALE and first.strain < ROUGH_STRAIN and plain:
                 return first, doubt
             if plain:
                 floor = displaced_px(first, floor)
-        lens, magnitude = LensPrior.rough(camera, focal_sigma), magnitude_of_order(centroids.flux)
+        lens, magnitude = LensPrior.rough(near, focal_sigma), magnitude_of_order(centroids.flux)
         rough = None
         for _ in range(2):  # the second time with what the stars are displaced by indeed
             C = roughened(centroids.covariance_px, len(centroids), floor)
@@ -331,21 +342,6 @@ def _bright_share(fit: Refined, centroids: Centroids) -> float:
     """Share of the brightest detections that a fit explains: the flux comes sorted."""
     count = min(len(centroids), BRIGHTEST)
     return np.count_nonzero(fit.identification.detections < count) / max(count, 1)
-
-
-def observer(julian_date_tt: float) -> tuple[float, np.ndarray]:
-    """Julian year, and Earth's barycentric velocity (3,) in N over that of light, at a Julian date in TT (erfa's epv00)."""
-    import erfa
-
-    _, barycentric = erfa.epv00(julian_date_tt, 0.0)
-    return 2000.0 + (julian_date_tt - 2451545.0) / 365.25, np.asarray(barycentric["v"]) * AU_DAY / LIGHT
-
-
-def observer_place(julian_date_tt: float) -> np.ndarray:
-    """Earth's barycentric position (3,) in N, astronomical units, at a Julian date in TT (erfa's epv00)."""
-    import erfa
-
-    return np.asarray(erfa.epv00(julian_date_tt, 0.0)[1]["p"])
 
 
 def _plain(vector: np.ndarray | None) -> tuple[float, ...] | None:

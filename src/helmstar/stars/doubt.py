@@ -114,16 +114,19 @@ def identify_uncalibrated(
 
 def _likelier(first: Doubted, doubt: Doubt, b: Identification) -> Doubted:
     """The second, at ODDS against it, where it is likelier and solved if the first is; with the work of both."""
-    a = first.identification
-    b = replace(
-        b,
-        probability_false=min(1.0, ODDS * b.probability_false),
-        log_odds=b.log_odds - float(np.log(ODDS)),
-        work=a.work + b.work,
-    )
+    a, b = first.identification, against(b, 1, first.identification.work)
     if b.log_odds > a.log_odds and (b.solved or not a.solved):
         return Doubted(b, doubt)
     return Doubted(replace(a, work=b.work), first.doubt)
 
 
-__all__ = ["Doubt", "Doubted", "identify_uncalibrated", "magnitude_of_order", "roughened"]
+def against(found: Identification, doubts: int, work: int) -> Identification:
+    """With ODDS against it for each of so many doubts, and the work of what was tried before."""
+    odds = ODDS**doubts
+    return replace(
+        found, probability_false=min(1.0, odds * found.probability_false), log_odds=found.log_odds - float(np.log(odds)),
+        work=work + found.work,
+    )  # fmt: skip
+
+
+__all__ = ["Doubt", "Doubted", "against", "identify_uncalibrated", "magnitude_of_order", "roughened"]

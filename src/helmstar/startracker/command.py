@@ -15,7 +15,8 @@ from ..errors import ConfigurationError, DataError
 from ..files import readable
 from ..imaging.calibrated import Calibrated, read_calibrated
 from ..progress import Progress
-from ..sensors.star_tracker import StarSolution, StarTracker, observer, observer_place
+from ..sensors.observer import observer, observer_place
+from ..sensors.star_tracker import StarSolution, StarTracker
 from ..stars.catalog import Catalog, load_gaia
 from ..stars.identify import LIMIT
 from .dates import instant_of, julian_date_tt

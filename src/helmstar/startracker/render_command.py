@@ -236,7 +236,7 @@ class _Sky:
 
     def at(self, date_tt: float | None) -> tuple[Any, np.ndarray]:
         """The catalogue, and directions (n, 3) at a Julian date in TT; None: J2000, seen from the barycentre at rest."""
-        from ..sensors.star_tracker import observer, observer_place
+        from ..sensors.observer import observer, observer_place
         from ..stars.patterns import aberrated
 
         stale = self._directions is None or (date_tt is not None and abs(date_tt - (self._date or 0.0)) > 1.0 / 24.0)
