@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import time
+from concurrent.futures import ProcessPoolExecutor
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -79,20 +81,21 @@ def one(k: int, seed: int) -> dict:
     }  # fmt: skip
 
 
-def run(count: int, seed: int, log: Path | None) -> dict:
-    """`count` lists; `log`: JSON lines to which each result goes, and which a later run continues."""
+def run(count: int, seed: int, log: Path | None, workers: int = 1) -> dict:
+    """`count` lists, by so many processes; `log`: JSON lines to which each result goes, and which a later run continues."""
     rows: list[dict] = []
     if log is not None and log.exists():
         rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
         rows = [row for row in rows if row["k"] < count]
     done = {row["k"] for row in rows}
-    with Progress(True) as progress:
-        task = progress.add("lists without a sky", count - len(done))
-        for k in (k for k in range(count) if k not in done):
-            rows.append(one(k, seed))
+    left = [k for k in range(count) if k not in done]
+    with Progress(True) as progress, ProcessPoolExecutor(workers) as pool:
+        task = progress.add("lists without a sky", len(left))
+        for row in pool.map(one, left, repeat(seed), chunksize=4) if workers > 1 else map(one, left, repeat(seed)):
+            rows.append(row)
             if log is not None:
                 with log.open("a", encoding="utf-8") as f:
-                    f.write(json.dumps(rows[-1]) + "\n")
+                    f.write(json.dumps(row) + "\n")
             progress.advance(task)
     return summary(rows)
 

@@ -1,14 +1,14 @@
 """Identification of stars in full-sky mode: rates, false solutions and milliseconds, on made-up centroid lists.
 
 python benchmarks/identification.py [--runs N] [--fields 12 20] [--full] [--kelvins FOLDER] [--json]
-python benchmarks/identification.py --false N [--log FILE] [--json]
+python benchmarks/identification.py --false N [--log FILE] [--workers N] [--json]
 python benchmarks/identification.py --sky FOLDER [--runs N] [--json]
 
 Every case has 30 true stars, the brightest of the field, on 1024 x 1024 pixels unless it says otherwise. `right` is the share
 solved with most matches true, `false` counts the other solutions. --full: 300 runs, seven fields.
 --kelvins: a folder with input.csv and result.csv of the European Kelvins contest, scored by its rule.
 --false: N lists of 5 to 400 false detections, or of skies of another camera, at fields of 5 to 25 deg; how many are called
-solved, with the upper 95% bound of the rate. --log: continues what an earlier run left there.
+solved, with the upper 95% bound of the rate. --log: continues what an earlier run left there; --workers: processes.
 --sky: rates against false stars, noise, missing stars and field over the whole sky; FOLDER gets sky.json and sky.html.
 """
 
@@ -131,13 +131,18 @@ def main() -> None:
     parser.add_argument("--fields", type=float, nargs="+")
     parser.add_argument("--false", type=int, metavar="N")
     parser.add_argument("--log", type=Path)
+    parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--sky", type=Path, metavar="FOLDER")
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--kelvins", type=Path)
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     if args.false or args.sky:
-        found = false_skies.run(args.false, 31, args.log) if args.false else whole_sky(args.sky, args.runs or 25)
+        found = (
+            false_skies.run(args.false, 31, args.log, args.workers)
+            if args.false
+            else whole_sky(args.sky, args.runs or 25)
+        )
         print(json.dumps(found) if args.json else "\n".join(lines(found)))
         return
     runs = args.runs if args.runs is not None else 300 if args.full else 40
