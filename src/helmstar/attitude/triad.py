@@ -46,7 +46,7 @@ def _triad(d: c.Directions) -> WahbaSolution:
     for j in range(3):
         P[j][j] = P[j][j] + s1
     q = c.only(_seen(d, u), q, xp)
-    return c.conclude(d, q, covariance=(tuple(P[0]), tuple(P[1]), tuple(P[2])))  # type: ignore[arg-type]
+    return c.conclude(d, q, covariance=(tuple(P[0]), tuple(P[1]), tuple(P[2])))  # rows of three, built in loops  # type: ignore[arg-type]
 
 
 def _triad_optimised(d: c.Directions) -> WahbaSolution:

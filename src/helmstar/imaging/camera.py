@@ -83,12 +83,12 @@ class Camera:
     @property
     def cx(self) -> float:
         """Column of the boresight, px."""
-        return self.centre_px[0]  # type: ignore[index]
+        return self.centre_px[0]  # set by __post_init__  # type: ignore[index]
 
     @property
     def cy(self) -> float:
         """Row of the boresight, px."""
-        return self.centre_px[1]  # type: ignore[index]
+        return self.centre_px[1]  # set by __post_init__  # type: ignore[index]
 
     @property
     def fov(self) -> float:

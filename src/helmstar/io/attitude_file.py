@@ -56,7 +56,7 @@ def conjugate(q: np.ndarray) -> np.ndarray:
 
 def attitude_layout(time: str, scale: str) -> Layout:
     """Layout of a table that holds attitudes in native columns; `time` and `scale` are for messages."""
-    return Layout(time, scale, 1.0, (), "rad/s", "body", Q_BN_COLUMNS, "bn", (), ())  # type: ignore[arg-type]
+    return Layout(time, scale, 1.0, (), "rad/s", "body", Q_BN_COLUMNS, "bn", (), ())  # names as text, checked there  # type: ignore[arg-type]
 
 
 def attitude_part(file: str, samples: AttitudeSamples, time: str, scale: str, log: ProblemLog) -> Part:

@@ -128,14 +128,14 @@ class Experiment:
             "target": ["B.T", "B.R"],
         }  # fmt: skip
         self.model, self.flight = self._model(), self._flight()
-        self.epochs = Epochs(t.dt, t.before, t.frame, t.burn, t.burns)  # type: ignore[arg-type]
+        self.epochs = Epochs(t.dt, t.before, t.frame, t.burn, t.burns)  # NumPy for JAX  # type: ignore[arg-type]
         self.end, self.terminal = None, None
         self.variables = dict(VARIABLES)
         if spec.terminal.filter != "none":
             self.end, self.terminal = Terminal.of(spec.terminal.filter, spec.seed)
             self.variables |= TERMINAL_VARIABLES
             self.coordinates["frame"] = np.arange(1, self.end.frames + 1)
-        self.simulate = Call(simulate, (Setting(np.asarray(spec.seed), np.asarray(self.update)),))  # type: ignore[arg-type]
+        self.simulate = Call(simulate, (Setting(np.asarray(spec.seed), np.asarray(self.update)),))  # NumPy for JAX  # type: ignore[arg-type]
         self.estimators = {n: self._call(c) for n, c in self._choices().items()}
 
     def _model(self) -> Model:

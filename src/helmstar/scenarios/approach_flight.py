@@ -176,7 +176,7 @@ def _linearised(model: Model, flight: Flight, epochs: Epochs) -> tuple[Array, Ar
     forces = model.process.params
 
     def body(x: Approach, dt: Array) -> tuple[Approach, tuple]:
-        F, _ = model.process.jacobian(forces, x, None, dt)  # type: ignore[misc]
+        F, _ = model.process.jacobian(forces, x, None, dt)  # this process has one  # type: ignore[misc]
         x = model.process.step(forces, x, None, dt, jnp.zeros(6))
         sight = Sight(look_at(-x.r), jnp.zeros(2), jnp.zeros((2, 2)))
         H = jax.jacfwd(lambda d: body_pixel(model.sensors[0].params, approach.boxplus(x, d), sight))(jnp.zeros(14))

@@ -125,7 +125,7 @@ def measured_directions(retraction: Retraction) -> Sensor:
     residuals for each, across it."""
 
     def jacobian(params: Any, x: Any, a: tuple[Array, Array]) -> Array:
-        return unit_star_directions(1.0, retraction).jacobian(params, x, a[0])  # type: ignore[misc]
+        return unit_star_directions(1.0, retraction).jacobian(params, x, a[0])  # not called without  # type: ignore[misc]
 
     known = unit_star_directions(1.0, retraction).jacobian is not None
     return Sensor(_told_predict, _told_minus, _told_cov, None, jacobian if known else None)
@@ -264,7 +264,7 @@ class Experiment:
         self.pictures = self._pictures(workers) if spec.star.level == "image" else None
         if self.pictures is not None:
             self.star_sigma = self.pictures.sigma
-            arrays = Pictures(self.pictures.z, self.pictures.cov, self.pictures.seen)  # type: ignore[arg-type]
+            arrays = Pictures(self.pictures.z, self.pictures.cov, self.pictures.seen)  # NumPy for JAX  # type: ignore[arg-type]
             self.simulate = Call(simulate_from_images, (Setting(**data), arrays))
         self.estimators = self._estimators()
 

