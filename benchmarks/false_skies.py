@@ -81,7 +81,25 @@ def one(k: int, seed: int) -> dict:
     }  # fmt: skip
 
 
-def run(count: int, seed: int, log: Path | None, workers: int = 1) -> dict:
+def one_known(k: int, seed: int) -> dict:
+    """As `one`, with a known zero point and field: the odds that the limit for these cameras is to be drawn from."""
+    rng = np.random.default_rng([seed, k, 1])
+    kind = CLASSES[k % len(CLASSES)]
+    camera, xy, magnitude, star = listing(kind, rng)
+    begin = time.process_time()
+    found = identify(
+        xy, camera, magnitude=magnitude, zero_point=0.0, focal_sigma=1e-4, limit=0.5,
+        sigma_px=float(rng.choice([0.2, 0.5, 1.0])), magnitude_sigma=float(rng.choice([0.05, 0.1, 0.2, 0.4])),
+    )  # fmt: skip
+    seconds = time.process_time() - begin
+    wrong = bool(found.solved and (star[found.detections] == found.stars).mean() < 0.5)
+    return {
+        "k": k, "class": kind, "range": False, "magnitudes": True, "n": len(xy), "false": wrong,
+        "right": found.solved and not wrong, "log_odds": float(found.log_odds), "work": found.work, "s": seconds,
+    }  # fmt: skip
+
+
+def run(count: int, seed: int, log: Path | None, workers: int = 1, known: bool = False) -> dict:
     """`count` lists, by so many processes; `log`: JSON lines to which each result goes, and which a later run continues."""
     rows: list[dict] = []
     if log is not None and log.exists():
@@ -91,7 +109,8 @@ def run(count: int, seed: int, log: Path | None, workers: int = 1) -> dict:
     left = [k for k in range(count) if k not in done]
     with Progress(True) as progress, ProcessPoolExecutor(workers) as pool:
         task = progress.add("lists without a sky", len(left))
-        for row in pool.map(one, left, repeat(seed), chunksize=4) if workers > 1 else map(one, left, repeat(seed)):
+        look = one_known if known else one
+        for row in pool.map(look, left, repeat(seed), chunksize=4) if workers > 1 else map(look, left, repeat(seed)):
             rows.append(row)
             if log is not None:
                 with log.open("a", encoding="utf-8") as f:

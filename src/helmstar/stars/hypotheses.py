@@ -99,8 +99,7 @@ def thinned(table: Pairs, V: np.ndarray, d: Detections) -> Pairs:
     """Without the stars that are too faint for any detection, where the zero point is known."""
     if d.zero_point is None or d.magnitude is None:
         return table
-    faintest = d.magnitude.max() + d.zero_point + 3.0 * d.magnitude_sigma
-    keep = np.flatnonzero(table.second < np.searchsorted(V, faintest, side="right"))
+    keep = np.flatnonzero(table.second < np.searchsorted(V, d.faintest, side="right"))
     return Pairs(table.first[keep], table.second[keep], table.angle[keep])
 
 

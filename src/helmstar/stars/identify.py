@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
@@ -16,7 +16,7 @@ from .patterns import BRIGHT, BRIGHTEST, FAINT, Sky
 from .pinhole import Camera
 from .problem import Detections, Fit, Freedom, prepare
 from .screen import Raster, raster, screen
-from .stage import stages
+from .stage import Stage, stages
 from .verify import HOPELESS, jacobian, probability_false, turn, verify
 
 Status = Literal["solved", "too few stars", "no match", "uncertain"]
@@ -32,6 +32,8 @@ KEPT = 5
 """Hypotheses of each chunk that are screened."""
 DEPTHS = ((BRIGHTEST, 1.0), (BRIGHT, 1.0), (FAINT, 0.15))
 """Pair tables with how probable it is that they lead to a solution which the others miss. The first is for unknown fields."""
+SEARCHED = ((1.0, 1.0), (0.25, 0.5), (2.5, 0.5))
+"""Factors on the magnitudes' sigma that the search takes where the zero point is known, and how probable each is."""
 WORTH = tuple(1.2e-8 * 2.0**k for k in range(10, -1, -1))
 """Solutions that a look at one more catalogue pair must promise, from first to last (`stage.Stage`)."""
 WORK = 6_000_000
@@ -147,28 +149,37 @@ def search(sky: Sky, d: Detections, freedom: Freedom, fewest: int, limit: float,
     enough = min(limit, LIMIT)
     fits: list[Fit] = []
     done = 0
-    tables = stages(sky, d, freedom, [(n, prior) for n, prior in DEPTHS if freedom.free or n != BRIGHTEST])
+    depths = [(n, prior) for n, prior in DEPTHS if freedom.free or n != BRIGHTEST]
+    tables = [stage for own, share in as_bright(d) for stage in stages(sky, own, freedom, depths, share)]
     cells = raster(d)
     for worth in WORTH:
         for stage in tables:
             for looked, found in stage.hypotheses(worth, KEPT, min(max(done, FIRST_CHUNK), CHUNK)):
                 done += looked
-                if found is not None and weigh(sky, stage.level, d, cells, found, freedom, fits, fewest, enough):
+                if found is not None and weigh(sky, stage, d, cells, found, freedom, fits, fewest, enough):
                     return fits, done
                 if done > work:
                     return fits, done
     return fits, done
 
 
+def as_bright(d: Detections) -> list[tuple[Detections, float]]:
+    """The detections as the search takes them, and how probable each is: with other sigmas of the magnitudes where the zero point
+    is known. Twice too narrow a sigma hides true stars among those that do not fit, too wide a one among those that do."""
+    if d.zero_point is None or d.magnitude is None:
+        return [(d, 1.0)]
+    return [(replace(d, magnitude_sigma=factor * d.magnitude_sigma), share) for factor, share in SEARCHED]
+
+
 def weigh(
-    sky: Sky, level: int, d: Detections, cells: Raster, found: Hypotheses, freedom: Freedom, fits: list[Fit], fewest: int,
+    sky: Sky, stage: Stage, d: Detections, cells: Raster, found: Hypotheses, freedom: Freedom, fits: list[Fit], fewest: int,
     limit: float,
 ) -> bool:  # fmt: skip
     """Screen hypotheses, verify what remains, the best first, and add the fits to the list; True once one is convincing."""
     n = int((found.score > fewest - 0.5).sum())
     if n == 0:
         return False
-    odds, R, f = screen(sky, level, d, cells, found.R[:n], found.f[:n], freedom)
+    odds, R, f = screen(sky, stage.level, stage.d, cells, found.R[:n], found.f[:n], freedom)
     closest = 2.0 * d.typical_sigma
     for k in np.argsort(-odds):
         if odds[k] < HOPELESS:
@@ -177,7 +188,7 @@ def weigh(
         focal = float(f[k])
         if any(same(R[k], focal, fit, closest / focal, 1e-3) for fit in fits):
             continue
-        fit = verify(sky, level, d, R[k], focal, freedom, first_gate=2.5, rounds=2)
+        fit = verify(sky, stage.level, d, R[k], focal, freedom, first_gate=2.5, rounds=2)
         if fit is None or len(fit.stars) < fewest:
             continue
         add(fits, fit)

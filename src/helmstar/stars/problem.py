@@ -64,9 +64,13 @@ class Detections:
     @cached_property
     def faintest(self) -> float:
         """V of the faintest star that may be among them: where the zero point is known, infinity elsewhere."""
+        return self.faintest_at(1.0)
+
+    def faintest_at(self, factor: float) -> float:
+        """The same if the magnitudes' sigma is `factor` times what was told."""
         if self.zero_point is None or self.magnitude is None or len(self.xy) == 0:
             return math.inf
-        return float(self.magnitude[-1]) + self.zero_point + 3.0 * self.magnitude_sigma
+        return float(self.magnitude[-1]) + self.zero_point + 3.0 * factor * self.magnitude_sigma
 
     @cached_property
     def in_c(self) -> np.ndarray:

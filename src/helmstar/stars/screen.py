@@ -180,7 +180,7 @@ def _compiled(library: ctypes.CDLL, sky: Sky, level: int, d: Detections, cells: 
         zero_point=np.nan if d.zero_point is None else d.zero_point, faintest=d.faintest, f_low=freedom.f_low,
         f_high=freedom.f_high, f_known=freedom.f_known, f_sigma=freedom.sigma, gate=GATE, first_gate=FIRST_GATE,
         second_gate=SECOND_GATE, volume=SO3_VOLUME * focal_volume(freedom), zero_point_range=ZERO_POINT_RANGE,
-        broad_share=BROAD_SHARE, broad_sigma=broad_sigma(d), **{k: address(x) for k, x in arrays.items()},
+        broad_share=BROAD_SHARE, broad_sigma=broad_sigma(d.magnitude_sigma), **{k: address(x) for k, x in arrays.items()},
     )  # fmt: skip
     R, f, odds = np.array(R, dtype=float, order="C"), np.array(f, dtype=float), np.empty(len(f))
     done = library.helmstar_screen

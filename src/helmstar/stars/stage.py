@@ -79,7 +79,9 @@ def detection_pairs(d: Detections) -> np.ndarray:
     return np.stack([i[order], j[order]], axis=1)
 
 
-def stages(sky: Sky, d: Detections, freedom: Freedom, depths: Sequence[tuple[int, float]]) -> list[Stage]:
+def stages(
+    sky: Sky, d: Detections, freedom: Freedom, depths: Sequence[tuple[int, float]], probable: float = 1.0
+) -> list[Stage]:
     """Of each depth (n stars per field, prior) the fields that the focal length allows, the widest first: their tables are small.
 
     A table of its own for each: dense tables of narrow fields, a look into which costs with 1/field^2, must not keep those of wide
@@ -92,7 +94,7 @@ def stages(sky: Sky, d: Detections, freedom: Freedom, depths: Sequence[tuple[int
         width = np.array([np.log(part.f_high / part.f_low) / LADDER[level] for level, part in levels])
         share = (width / width.sum()).tolist()
     return [
-        Stage(sky, n, d, pairs, level, part, prior * own)
+        Stage(sky, n, d, pairs, level, part, probable * prior * own)
         for n, prior in depths
         for (level, part), own in reversed(list(zip(levels, share)))
     ]

@@ -14,12 +14,14 @@ static const double TURN = 2.0 * 3.14159265358979323846;
 /* As in verify.py: Detections, the stars that may be seen, Freedom, and the constants of the model. */
 typedef struct {
     int64_t n, stars, limit, has_magnitude, knows_zero, is_free;
-    double low[2], high[2], faintest, magnitude_sigma, zero_point, zero_point_range, broad_share, broad_sigma;
+    double low[2], high[2], faintest, magnitude_sigma, zero_point, zero_point_range, broad_share, broad_most, broad_factor;
     double f_low, f_high, f_known, f_weight, log_volume, gate, hopeless;
     /* (n, 2), (n,), (n,), (n,), (n + 1,), (n,): the last is not read without magnitudes */
     const double *xy, *sigma, *log_density, *log_magnitude_density, *vacancy, *magnitude;
     const double *r, *V; /* (stars, 3), (stars,) */
     const double *log_factorial, *harmonic;
+    int64_t magnitude_scales; /* factors on the magnitudes' sigma, and the logs of their priors */
+    const double *magnitude_scale, *log_prior;
 } Field;
 
 /* A star that is seen, by its index, and what it was matched with. */
@@ -128,11 +130,12 @@ static double zero_point(const Field *q, const Seen *seen, const Match *m, int64
 }
 
 /* As `magnitude_gain`, of one match. */
-static double magnitude_gain(const Field *q, double V, int64_t j, double zero)
+static double magnitude_gain(const Field *q, double V, int64_t j, double zero, double factor)
 {
     if (!q->has_magnitude)
         return 0.0;
-    double d = V - q->magnitude[j] - zero, square = d * d, s = q->magnitude_sigma, broad = q->broad_sigma;
+    double d = V - q->magnitude[j] - zero, square = d * d, s = factor * q->magnitude_sigma;
+    double broad = q->broad_factor * s < q->broad_most ? q->broad_factor * s : q->broad_most;
     double density = (1.0 - q->broad_share) / s * exp(-0.5 / (s * s) * square)
         + q->broad_share / broad * exp(-0.5 / (broad * broad) * square);
     return log(density / sqrt(TURN) + 1e-6) - q->log_magnitude_density[j];
@@ -270,16 +273,16 @@ static double log_odds(const Field *q, const Match *m, int64_t count, int64_t ex
     return top + log(all / q->harmonic[expected]);
 }
 
-/* Log odds of what matches, of which only those stay that speak for the hypothesis: *count is theirs, and the information. Not to be
-   read where fewer than two stay. */
-static double weigh(
+/* Log odds of what matches at one sigma of the magnitudes, without its prior. Only those stay that speak for the hypothesis: *count is
+   theirs, and the information. Not to be read where fewer than two stay. */
+static double weigh_at(
     const Field *q, const Seen *seen, Match *m, int64_t *count, int64_t expected, double f, double scale, double zero,
-    double information[4][4])
+    double factor, double information[4][4])
 {
     double A[4][4], g[4], sigma[DEEP], logarithm, price = 0.0;
     int64_t all = *count, good = 0;
     for (int64_t k = 0; k < all; k++) {
-        double gain = magnitude_gain(q, q->V[seen[m[k].rank].star], m[k].j, zero) - 0.5 * m[k].square
+        double gain = magnitude_gain(q, q->V[seen[m[k].rank].star], m[k].j, zero, factor) - 0.5 * m[k].square
             - log(TURN * (m[k].sigma * m[k].sigma)) - q->log_density[m[k].j];
         if (!(gain > 0.0))
             continue;
@@ -299,6 +302,41 @@ static double weigh(
     double sign = eliminate(A, g, &logarithm), left = 0.5 * (4.0 * log(TURN) - logarithm) - q->log_volume;
     left = !(sign > 0.0) ? -INFINITY : left > 0.0 ? 0.0 : left;
     return log_odds(q, m, good, expected) + price - log(scale) + left;
+}
+
+/* As `_Field._weigh`: the matches m (*count,) become those that stay at the likeliest sigma. */
+static double weigh(
+    const Field *q, const Seen *seen, Match *m, int64_t *count, int64_t expected, double f, double scale, double zero,
+    double information[4][4])
+{
+    Match some[DEEP], best[DEEP];
+    int64_t all = *count, stay = 0;
+    double top = -INFINITY, total = -INFINITY, own[4][4];
+    for (int64_t h = 0; h < q->magnitude_scales; h++) {
+        int64_t good = all;
+        memcpy(some, m, sizeof(Match) * (size_t)all);
+        int64_t deep = expected;
+        if (q->has_magnitude && q->knows_zero) {
+            double faintest = q->magnitude[q->n - 1] + q->zero_point + 3.0 * q->magnitude_scale[h] * q->magnitude_sigma;
+            while (deep > 0 && q->V[seen[deep - 1].star] > faintest)
+                deep--;
+            while (good > 0 && some[good - 1].rank >= deep)
+                good--;
+        }
+        double odds = weigh_at(q, seen, some, &good, deep, f, scale, zero, q->magnitude_scale[h], own) + q->log_prior[h];
+        if (good < 2)
+            continue;
+        double larger = odds > total ? odds : total, smaller = odds > total ? total : odds;
+        total = smaller == -INFINITY ? larger : larger + log1p(exp(smaller - larger));
+        if (stay == 0 || odds > top) {
+            top = odds, stay = good;
+            memcpy(best, some, sizeof(Match) * (size_t)good);
+            memcpy(information, own, sizeof own);
+        }
+    }
+    *count = stay;
+    memcpy(m, best, sizeof(Match) * (size_t)stay);
+    return total;
 }
 
 /* As `_Field._at_scale`, from R and f, the head of `fit`. */

@@ -14,7 +14,9 @@ expected in the image matched, residuals r_j (px), detections of density lam (1/
 - The last factor is the price of having fitted the attitude (and focal length): the volume that the fit leaves over the volume V
   that it was chosen from, 8 pi^2 for SO(3). It takes the place of a count of tested hypotheses, and with it the odds are
   posterior odds whatever the search did. The zero point of the magnitudes and the scale s pay likewise.
-- p(m | star) is a Gaussian around the catalogue's V and zero point, with a broad share for other bands and variable stars.
+- p(m | star) is a Gaussian around the catalogue's V and zero point, with a broad share for other bands and variable stars. Where the
+  zero point is known, how well the magnitudes fit the catalogue's is not taken on trust: the odds are averaged over sigmas from an
+  eighth of the one told to four times it.
 """
 
 from __future__ import annotations
@@ -43,6 +45,14 @@ HOPELESS = -14.0
 """Log odds after the first step below which a hypothesis is dropped."""
 SCALES = (1.0, 1.8, 3.2)
 """Factors on the detections' sigmas; all but the first are tried where the residuals ask for it."""
+MAGNITUDE_SCALES = np.array([1.0, 0.5, 2.0, 0.25, 4.0, 0.125])
+"""Factors on the magnitudes' sigma that a known zero point is averaged over."""
+_weights = np.exp2(-np.abs(np.log2(MAGNITUDE_SCALES)))
+LOG_MAGNITUDE_PRIORS = np.log(_weights / _weights.sum())
+"""Of these: what was told is the likeliest, each factor of two half as likely as the one before."""
+ODD_MAGNITUDES = 0.1
+"""1 sigma, mag, that single stars may always be off by where the zero point is known: variables, doubles, other bands."""
+_AS_TOLD = np.ones(1), np.zeros(1)
 GATE = 3.6
 """Residuals of matches, over sigma."""
 MOST_IN_C, DEEPEST_IN_C = 512, 398
@@ -168,18 +178,34 @@ def zero_point_price(d: Detections, count: int) -> float:
     return math.log(min(1.0, math.sqrt(2.0 * math.pi) * sigma / ZERO_POINT_RANGE))
 
 
-def broad_sigma(d: Detections) -> float:
-    """Of magnitudes that are not what the catalogue says."""
-    return min(BROAD_SIGMA, BROAD_FACTOR * d.magnitude_sigma)
+def magnitude_scales(d: Detections) -> tuple[np.ndarray, np.ndarray]:
+    """Factors (h,) on the magnitudes' sigma that are to be averaged over, and the logs of their priors.
+
+    A zero point that is fitted takes up most of what three or four stars tell of sigma.
+    """
+    return _AS_TOLD if d.magnitude is None or d.zero_point is None else (MAGNITUDE_SCALES, LOG_MAGNITUDE_PRIORS)
 
 
-def magnitude_gain(d: Detections, V: np.ndarray, j: np.ndarray, zero: float | np.ndarray) -> np.ndarray:
-    """Log likelihood ratio (k,) of the magnitudes of stars V (k,) matched with detections j (k,), at a zero point."""
+def faintest(d: Detections) -> float:
+    """V of the faintest star that is looked for."""
+    return d.faintest_at(math.hypot(1.0, ODD_MAGNITUDES / d.magnitude_sigma))
+
+
+def broad_sigma(sigma: float) -> float:
+    """Of magnitudes that are not what the catalogue says, where those that are have this sigma."""
+    return min(BROAD_SIGMA, BROAD_FACTOR * sigma)
+
+
+def magnitude_gain(
+    d: Detections, V: np.ndarray, j: np.ndarray, zero: float | np.ndarray, scale: float = 1.0
+) -> np.ndarray:
+    """Log likelihood ratio (k,) of the magnitudes of stars V (k,) matched with detections j (k,), at a zero point and `scale`
+    times the sigma told."""
     if d.magnitude is None:
         return np.zeros(len(j))
-    s = d.magnitude_sigma
+    s = scale * d.magnitude_sigma
     square = (V - d.magnitude[j] - zero) ** 2
-    broad = broad_sigma(d)
+    broad = broad_sigma(s)
     density = (1.0 - BROAD_SHARE) / s * np.exp(-0.5 / s**2 * square) + BROAD_SHARE / broad * np.exp(
         -0.5 / broad**2 * square
     )
@@ -242,10 +268,12 @@ class _InC(ctypes.Structure):
     _fields_ = (
         [(k, ctypes.c_int64) for k in ("n", "stars", "limit", "has_magnitude", "knows_zero", "is_free")]
         + [(k, ctypes.c_double) for k in ("low_x", "low_y", "high_x", "high_y", "faintest", "magnitude_sigma", "zero_point")]
-        + [(k, ctypes.c_double) for k in ("zero_point_range", "broad_share", "broad_sigma", "f_low", "f_high", "f_known")]
+        + [(k, ctypes.c_double) for k in ("zero_point_range", "broad_share", "broad_most", "broad_factor")]
+        + [(k, ctypes.c_double) for k in ("f_low", "f_high", "f_known")]
         + [(k, ctypes.c_double) for k in ("f_weight", "log_volume", "gate", "hopeless")]
         + [(k, ctypes.c_void_p) for k in ("xy", "sigma", "log_density", "log_magnitude_density", "vacancy", "magnitude")]
         + [(k, ctypes.c_void_p) for k in ("r", "V", "log_factorial", "harmonic")]
+        + [("magnitude_scales", ctypes.c_int64), ("magnitude_scale", ctypes.c_void_p), ("log_prior", ctypes.c_void_p)]
     )  # fmt: skip
 
 
@@ -284,7 +312,7 @@ class _Field:
         d, freedom, zero = self.d, self.freedom, self.d.zero_point
         for turn_number in range(rounds + 1):
             p, _ = project(self.r, R, f)
-            seen = np.flatnonzero(inside(p, d.low, d.high) & (d.faintest >= self.V))[: self.limit]
+            seen = np.flatnonzero(inside(p, d.low, d.high) & (faintest(d) >= self.V))[: self.limit]
             p = p[seen]
             widen = 1.0 if turn_number == rounds else (first_gate, 0.5 * (1.0 + first_gate), 1.0)[min(turn_number, 2)]
             excess = None
@@ -298,18 +326,11 @@ class _Field:
             sigma = scale * d.sigma[j]
             square = (residual**2).sum(axis=1) / sigma**2
             if turn_number == rounds or (turn_number == 1 and rounds > 2):
-                V = self.V[seen[i]]
-                zero = zero_point(d, V, j)
-                gain = magnitude_gain(d, V, j, zero) - 0.5 * square - np.log(2.0 * np.pi * sigma**2) - d.log_density[j]
-                # A match that speaks against the hypothesis is none: the star is missing and the detection false.
-                good = np.flatnonzero(gain > 0.0)
-                if len(good) < 2:
+                zero = zero_point(d, self.V[seen[i]], j)
+                weighed = self._weigh(p, seen, i, j, residual, square, sigma, f, scale, zero)
+                if weighed is None:
                     return None
-                _, information = step(p[i[good]] / f, residual[good], sigma[good], f, freedom)
-                total = (
-                    log_odds(gain[good], i[good], len(seen), d.vacancy) + zero_point_price(d, len(i)) - np.log(scale)
-                )
-                total += float(fit_volumes(information[None], freedom, self.volume)[0])
+                total, good, information = weighed
                 if turn_number == rounds:
                     stars = self.candidates[seen[i[good]]]
                     return Fit(R, f, stars, j[good], residual[good], total, scale, zero, covariance_of(information))
@@ -325,6 +346,30 @@ class _Field:
             f = min(max(f, 0.97 * freedom.f_low), 1.03 * freedom.f_high)
         return None
 
+    def _weigh(
+        self, p: np.ndarray, seen: np.ndarray, i: np.ndarray, j: np.ndarray, residual: np.ndarray, square: np.ndarray,
+        sigma: np.ndarray, f: float, scale: float, zero: float,
+    ) -> tuple[float, np.ndarray, np.ndarray] | None:  # fmt: skip
+        """Log odds averaged over the magnitudes' sigma, and of the likeliest one the matches that stay and the information;
+        None where fewer than two stay."""
+        d, V = self.d, self.V[seen[i]]
+        place = -0.5 * square - np.log(2.0 * np.pi * sigma**2) - d.log_density[j]
+        odds, best = [], None
+        for factor, prior in zip(*magnitude_scales(d)):
+            expected = int((self.V[seen] <= d.faintest_at(factor)).sum())
+            gain = magnitude_gain(d, V, j, zero, factor) + place
+            # A match that speaks against the hypothesis is none: the star is missing and the detection false.
+            good = np.flatnonzero((gain > 0.0) & (i < expected))
+            if len(good) < 2:
+                continue
+            _, information = step(p[i[good]] / f, residual[good], sigma[good], f, self.freedom)
+            total = log_odds(gain[good], i[good], expected, d.vacancy) + zero_point_price(d, len(i)) - np.log(scale)
+            total += float(fit_volumes(information[None], self.freedom, self.volume)[0]) + prior
+            if best is None or total > max(odds):
+                best = good, information
+            odds.append(total)
+        return None if best is None else (float(np.logaddexp.reduce(odds)), *best)
+
     def _in_c(self) -> tuple[_InC, list[np.ndarray]]:
         """For verify.c, and the arrays that it points to."""
         d, freedom, n, stars = self.d, self.freedom, len(self.d), len(self.candidates)
@@ -334,12 +379,14 @@ class _Field:
             )
         arrays = [np.ascontiguousarray(x, dtype=float) for x in (d.in_c, self.r, self.V)]
         listed, r, V = (address(x) for x in arrays)
+        factors, priors = magnitude_scales(d)
         return _InC(
             n, stars, self.limit, d.magnitude is not None, d.zero_point is not None, freedom.free,
-            *d.low.tolist(), *d.high.tolist(), d.faintest, d.magnitude_sigma, d.zero_point or 0.0, ZERO_POINT_RANGE,
-            BROAD_SHARE, broad_sigma(d), freedom.f_low, freedom.f_high, freedom.f_known, 1.0 / max(freedom.sigma, 1e-6) ** 2,
+            *d.low.tolist(), *d.high.tolist(), faintest(d), d.magnitude_sigma, d.zero_point or 0.0, ZERO_POINT_RANGE,
+            BROAD_SHARE, BROAD_SIGMA, BROAD_FACTOR, freedom.f_low, freedom.f_high, freedom.f_known, 1.0 / max(freedom.sigma, 1e-6) ** 2,
             math.log(self.volume * focal_volume(freedom)), GATE, HOPELESS,
             *(listed + 8 * k for k in (0, 2 * n, 3 * n, 4 * n, 5 * n, 6 * n + 1)), r, V, *_TABLES,
+            len(factors), address(factors), address(priors),
         ), arrays  # fmt: skip
 
     def _compiled(
