@@ -1,14 +1,16 @@
 """Identification of stars in full-sky mode: rates, false solutions and milliseconds, on made-up centroid lists.
 
 python benchmarks/identification.py [--runs N] [--fields 12 20] [--full] [--kelvins FOLDER] [--json]
-python benchmarks/identification.py --false N [--log FILE] [--workers N] [--json]
+python benchmarks/identification.py --false N [--known] [--log FILE] [--workers N] [--json]
 python benchmarks/identification.py --sky FOLDER [--runs N] [--json]
 
 Every case has 30 true stars, the brightest of the field, on 1024 x 1024 pixels unless it says otherwise. `right` is the share
 solved with most matches true, `false` counts the other solutions. --full: 300 runs, seven fields.
 --kelvins: a folder with input.csv and result.csv of the European Kelvins contest, scored by its rule.
+It is solved with magnitudes as told, and again with zero point and scatter from its own solutions.
 --false: N lists of 5 to 400 false detections, or of skies of another camera, at fields of 5 to 25 deg; how many are called
-solved, with the upper 95% bound of the rate. --log: continues what an earlier run left there; --workers: processes.
+solved, with the upper 95% bound of the rate. --known: with a known zero point and no limit, for the tail of the
+odds. --log: continues what an earlier run left there; --workers: processes.
 --sky: rates against false stars, noise, missing stars and field over the whole sky; FOLDER gets sky.json and sky.html.
 """
 
@@ -24,7 +26,7 @@ import numpy as np
 from problem import table
 
 from helmstar.stars import Pinhole, default_sky, identify
-from helmstar.stars.identify import LIMIT
+from helmstar.stars.identify import LIMIT_KNOWN
 from helmstar.stars.synthetic import scene
 
 SIZE = (1024, 1024)
@@ -63,15 +65,27 @@ def monte_carlo(fov_deg: float, runs: int, seed: int, magnitudes: bool, fov_rang
     }
 
 
-def kelvins(folder: Path, limit: float) -> dict[str, float]:
-    """The contest's score of 100 scenes: y upwards, magnitudes calibrated.
+def kelvins(folder: Path, limit: float | None) -> dict[str, dict[str, float]]:
+    """The contest's score of 100 scenes, with magnitudes as told, and with what the scenes solved so tell of them, as one would
+    calibrate a camera on its own frames: no answer is used for that."""
+    told = kelvins_scored(folder, limit, 0.0, 0.05)
+    difference = told.pop("differences")
+    zero = float(np.median(difference))
+    sigma = 1.4826 * float(np.median(np.abs(difference - zero)))
+    own = kelvins_scored(folder, limit, zero, sigma)
+    own.pop("differences")
+    return {"as told": told, f"zero point {zero:.3f}, sigma {sigma:.3f}": own}
+
+
+def kelvins_scored(folder: Path, limit: float | None, zero_point: float, magnitude_sigma: float) -> dict:
+    """Score, and V minus magnitude of all matches: y upwards.
 
     The field (DEG_X) and the variance of positions (POS_VARIANCE) are those of the contest's own calibration file.
     """
     camera = Pinhole.of_field(float(np.radians(10.0)), (1920, 1440))
     scenes = [np.array(line.split(","), dtype=float).reshape(-1, 3) for line in _lines(folder / "input.csv")]
     truths = [np.array(line.split(","), dtype=int) for line in _lines(folder / "result.csv")]
-    score, wrong, solved, ms = 0.0, 0, 0, []
+    score, wrong, solved, ms, differences = 0.0, 0, 0, [], []
     for s, truth in zip(scenes, truths):
         xy = np.stack([s[:, 0], 1440.0 - s[:, 1]], axis=1)
         begin = time.perf_counter()
@@ -81,18 +95,22 @@ def kelvins(folder: Path, limit: float) -> dict[str, float]:
             magnitude=s[:, 2],
             sigma_px=0.22,
             focal_sigma=1e-4,
-            magnitude_sigma=0.05,
-            zero_point=0.0,
+            magnitude_sigma=magnitude_sigma,
+            zero_point=zero_point,
             limit=limit,
         )
         ms.append(1e3 * (time.perf_counter() - begin))
+        differences.append(default_sky().magnitude[found.stars] - s[found.detections, 2])
         answer = np.full(len(truth), -1)
         answer[found.detections] = found.hip
         true, answered = truth >= 0, answer >= 0
         bad = int((answered & (answer != truth)).sum())
         score += max((int((answered & (answer == truth)).sum()) - 2 * bad) / max(int(true.sum()), 1), -1.0)
         wrong, solved = wrong + (bad > 0), solved + found.solved
-    return {"score": score, "solved": solved, "with_wrong": wrong, "ms_median": float(np.median(ms)), "ms_max": max(ms)}
+    return {
+        "score": score, "solved": solved, "with_wrong": wrong, "ms_median": float(np.median(ms)), "ms_max": max(ms),
+        "differences": np.concatenate(differences),
+    }  # fmt: skip
 
 
 def _lines(path: Path) -> list[str]:
@@ -117,6 +135,8 @@ def lines(found: dict):
     for key, value in found.items():
         if key == "classes":
             yield from (f"{name}: " + ", ".join(f"{k} {v:.4g}" for k, v in row.items()) for name, row in value.items())
+        elif key == "over":
+            yield "log odds without a true sky: " + ", ".join(f"{n} over {x}" for x, n in value.items())
         elif key == "cells":
             for c in value:
                 yield ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in c.items())
@@ -130,6 +150,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int)
     parser.add_argument("--fields", type=float, nargs="+")
     parser.add_argument("--false", type=int, metavar="N")
+    parser.add_argument("--known", action="store_true")
     parser.add_argument("--log", type=Path)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--sky", type=Path, metavar="FOLDER")
@@ -139,7 +160,7 @@ def main() -> None:
     args = parser.parse_args()
     if args.false or args.sky:
         found = (
-            false_skies.run(args.false, 31, args.log, args.workers)
+            false_skies.run(args.false, 31, args.log, args.workers, args.known)
             if args.false
             else whole_sky(args.sky, args.runs or 25)
         )
@@ -159,8 +180,9 @@ def main() -> None:
         rows[f"{fov:g} deg, sought in 5..25"] = monte_carlo(fov, max(runs // 4, 1), 3, True, fov_range=whole)
     out: dict = {"cases": rows}
     if args.kelvins:
-        for limit in (LIMIT, 0.01):
-            out[f"kelvins at {limit:g}"] = kelvins(args.kelvins, limit)
+        for limit in (None, 0.01):
+            for magnitudes, row in kelvins(args.kelvins, limit).items():
+                out[f"kelvins, limit {limit or LIMIT_KNOWN:g}, magnitudes {magnitudes}"] = row
     if args.json:
         print(json.dumps(out))
         return
