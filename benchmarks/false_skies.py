@@ -143,6 +143,8 @@ def summary(rows: list[dict]) -> dict:
         "lists": n,
         "false": false,
         "rate_upper_95": float(beta.ppf(0.95, false + 1, n - false)),
-        "over": {f"{x:g}": sum(row["log_odds"] > x and not row["right"] for row in rows) for x in (0, 1, 2, 3, 4, 5, 6, 7)},
+        "over": {
+            f"{x:g}": sum(row["log_odds"] > x and not row["right"] for row in rows) for x in (0, 1, 2, 3, 4, 5, 6, 7)
+        },
         "classes": classes,
     }

@@ -12,7 +12,7 @@ import helmstar
 ROOT = Path(helmstar.__file__).parent
 FLOORS = {
     "errors": -2, "files": -2, "units": -2, "backend": -2, "versions": -2, "progress": -2,
-    "native": -3, "configuration": -1, "geometry": 0,
+    "native": -3, "configuration": -1, "geometry": 0, "distortion": 0,
     "core": 1, "attitude": 1, "astro": 1, "imaging": 1,
     "stars": 2, "filters": 2, "models": 2, "evaluate": 2,
     "sensors": 3, "io": 3,

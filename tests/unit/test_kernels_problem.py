@@ -17,7 +17,8 @@ from helmstar.stars.patterns import Sky, Window
 from helmstar.stars.problem import MOST_DETECTIONS, Detections, prepare
 
 MODULES = [importlib.import_module(f"helmstar.stars.{m}") for m in ("patterns", "problem")]
-BARREL, NONE = (-0.2, 0.05, 1e-3, -5e-4, 0.01), (0.0, 0.0, 0.0, 0.0, 0.0)
+NONE, BARREL = (0.0, 0.0, 0.0, 0.0, 0.0), (-0.2, 0.05, 1e-3, -5e-4, 0.01)
+PINCUSHION, FOLDS = (0.9, 0.2, 1e-3, -5e-4, 0.1), (-0.6, 0.0, 0.0, 0.0, 0.0)
 pytestmark = pytest.mark.skipif(
     kernels() is None, reason="installed without compiled kernels, or their sources changed since"
 )
@@ -38,7 +39,7 @@ def assert_alike(a: tuple[Detections, np.ndarray], b: tuple[Detections, np.ndarr
         assert d.magnitude is e.magnitude
     else:
         assert np.array_equal(d.magnitude, e.magnitude)
-    # One rounding of a product here and there; twenty steps of a distortion's inverse feel it no more than that.
+    # One rounding of a product here and there; Newton's last step feels it no more than that.
     assert d.xy == pytest.approx(e.xy, rel=1e-13, abs=1e-10)
     assert ours == pytest.approx(theirs, rel=1e-14)
     assert d.sigma == pytest.approx(e.sigma, rel=1e-14)
@@ -55,11 +56,12 @@ def assert_alike(a: tuple[Detections, np.ndarray], b: tuple[Detections, np.ndarr
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 10**6), n=st.sampled_from([0, 1, 2, 3, 16, 119, 120, 121, 400]), told=st.integers(0, 2),
-    sigmas=st.integers(0, 2), aspect=st.sampled_from([1.0, 1.7]), bent=st.booleans(), spoiled=st.booleans(), close=st.booleans(),
+    sigmas=st.integers(0, 2), aspect=st.sampled_from([1.0, 1.7]),
+    lens=st.sampled_from([NONE, BARREL, PINCUSHION]), spoiled=st.booleans(), close=st.booleans(),
 )  # fmt: skip
-def test_a_list_is_made_ready_as_by_numpy(seed, n, told, sigmas, aspect, bent, spoiled, close):
+def test_a_list_is_made_ready_as_by_numpy(seed, n, told, sigmas, aspect, lens, spoiled, close):
     rng = np.random.default_rng(seed)
-    c = Pinhole(1500.0, (500.0, 420.0), (1024, 768), aspect, BARREL if bent else NONE)
+    c = Pinhole(1500.0, (500.0, 420.0), (1024, 768), aspect, lens)
     # Close together many crowd each other; whole magnitudes are often equal.
     xy = rng.uniform(0, 12.0 if close else 768.0, (n, 2))
     m = np.round(rng.uniform(3, 9, n), int(rng.integers(0, 3)))
@@ -83,6 +85,19 @@ def test_a_list_is_made_ready_as_by_numpy(seed, n, told, sigmas, aspect, bent, s
         assert (np.diff(d.magnitude) >= 0.0).all()
     for k in range(1, len(d)):
         assert np.abs(d.xy[:k] - d.xy[k]).max(axis=1).min() >= 1.0
+
+
+def test_places_that_no_direction_reaches_are_left_out():
+    c = Pinhole(1000.0, (512.0, 384.0), (1024, 768), 1.0, FOLDS)
+    xy = np.random.default_rng(8).uniform([0.0, 0.0], [1024.0, 768.0], (100, 2))
+    # x - 0.6 x^3 grows up to x = 0.745 (FOLD of slope stays), where it is 0.497.
+    there = np.hypot(*(xy - c.centre_px).T) < 0.4969 * 1000.0
+    d, e = prepare(xy, c, None, None, 0.3, 0.4, None)[0], in_numpy(prepare, xy, c, None, None, 0.3, 0.4, None)[0]
+    assert there.sum() < 95
+    assert np.array_equal(d.order, np.flatnonzero(there))
+    assert np.array_equal(d.order, e.order)
+    # Near the fold the slope is thousandths: so much more of the last step is left.
+    assert d.xy == pytest.approx(e.xy, abs=1e-7)
 
 
 def test_parts_of_arrays_are_read_as_such():

@@ -194,6 +194,17 @@ def test_distortion_comes_off():
     assert np.allclose(ideal_pixels(c, image_pixels(c, v)), 2000.0 * v[:, :2], atol=1e-8)
 
 
+@pytest.mark.parametrize(
+    "distortion", [(0.9, 0.3, 2e-3, -1e-3, 0.1), (-0.25, 0.08, 0.0, 0.0, -0.01), (-0.3, 0.0, 0.0, 0.0, 0.0)]
+)
+def test_strong_distortion_comes_off_far_from_the_middle(distortion):
+    c = Pinhole(600.0, (500.0, 400.0), (1000, 800), 1.0, distortion)
+    v = np.random.default_rng(13).uniform([-0.7, -0.7, 1.0], [0.7, 0.7, 1.0], (200, 3))
+    # Newton's last step is below 1e-15; the least slope here is 0.1.
+    assert np.allclose(ideal_pixels(c, image_pixels(c, v)), 600.0 * v[:, :2], rtol=0.0, atol=1e-9)
+    assert np.isnan(image_pixels(Pinhole(600.0, (500.0, 400.0), (1000, 800), 1.0, (-0.6, 0.0, 0.0, 0.0, 0.0)), v)).any()
+
+
 def test_aberration_moves_towards_the_apex_by_its_angle():
     r = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     moved = patterns.aberrated(r, np.array([0.0, 0.0, 1e-4]))

@@ -21,12 +21,11 @@ from typing import Any
 
 import numpy as np
 
+from ..distortion import distort, reach, undistort, undistort_one
 from ..errors import ConfigurationError
 from ..files import write_atomically
 
 MAX_SIDE_PX = 100_000
-_NEWTON_STEPS = 12
-_FOLD = 1e-3  # the least slope of the distorted radius over the true one: below it the lens folds over
 _TABLE = "camera"
 
 
@@ -139,17 +138,7 @@ class Camera:
     @property
     def _reach(self) -> float:
         """The radius sqrt(x^2 + y^2) up to which the radial distortion grows; infinite for most lenses."""
-        k1, k2, _, _, k3 = self.distortion
-        # Tiny terms fold beyond 88 deg, and spoil the roots.
-        a, b, c = (0.0 if abs(k) < 1e-9 else k for k in (3 * k1, 5 * k2, 7 * k3))
-        if not c:
-            square = a * a - 4 * b * (1 - _FOLD)
-            inverse = 0.5 * (math.sqrt(square) - a) / (1 - _FOLD) if square >= 0.0 else 0.0  # of r^2
-            return inverse**-0.5 if inverse > 0.0 else math.inf
-        slope = np.array([c, b, a, 1 - _FOLD])
-        roots = np.roots(slope)
-        real = roots.real[(np.abs(roots.imag) < 1e-9 * (1 + np.abs(roots))) & (roots.real > 0)]
-        return float(np.sqrt(real.min())) if real.size else math.inf
+        return reach(self.distortion)
 
     def _folds(self) -> bool:
         """Whether a corner lies beyond what the distortion reaches."""
@@ -171,59 +160,22 @@ class Camera:
 
     def distort(self, x: Any, y: Any) -> tuple[Any, ...]:
         """Of arrays or numbers x, y: x', y' and the derivatives dx'/dx, dx'/dy, dy'/dx, dy'/dy."""
-        k1, k2, p1, p2, k3 = self.distortion
-        r2 = x * x + y * y
-        g = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        h = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # dg/dx = h x
-        xd = x * g + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        yd = y * g + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        cross = h * x * y + 2 * p1 * x + 2 * p2 * y
-        return xd, yd, g + h * x * x + 2 * p1 * y + 6 * p2 * x, cross, cross, g + h * y * y + 6 * p1 * y + 2 * p2 * x
+        return distort(x, y, self.distortion)
 
     def plane(self, u: float, v: float) -> tuple[float, float]:
         """X/Z and Y/Z of the direction that is seen at one pixel, as `directions` in plain numbers; NaN where there is none."""
         xd, yd = (u - self.cx) / self.focal_px, (v - self.cy) * (self.aspect / self.focal_px)
         if not any(self.distortion):
             return xd, yd
-        x, y, reach = xd, yd, self._reach
-        try:
-            for _ in range(_NEWTON_STEPS):
-                fx, fy, a, b, c, d = self.distort(x, y)
-                ex, ey, det = fx - xd, fy - yd, a * d - b * c
-                dx, dy = (d * ex - b * ey) / det, (a * ey - c * ex) / det
-                x, y = x - dx, y - dy
-                back = min(1.0, reach / max(math.hypot(x, y), 1e-300))  # see `_plane`
-                x, y = x * back, y * back
-                if not abs(dx) + abs(dy) > 1e-15:
-                    break
-            fx, fy = self.distort(x, y)[:2]
-        except (OverflowError, ZeroDivisionError):
-            return math.nan, math.nan
-        return (x, y) if math.hypot(fx - xd, fy - yd) < 1e-9 else (math.nan, math.nan)
+        return undistort_one(xd, yd, self.distortion, self._reach)
 
     def _plane(self, xy_px: np.ndarray) -> np.ndarray:
-        """x, y on the plane Z = 1 (..., 2): Newton's method on the distortion, started at the distorted place."""
+        """x, y on the plane Z = 1 (..., 2); NaN where the distortion has no inverse."""
         xd = (xy_px[..., 0] - self.cx) / self.focal_px
         yd = (xy_px[..., 1] - self.cy) * (self.aspect / self.focal_px)
         if not any(self.distortion):
             return np.stack([xd, yd], axis=-1)
-        x, y = xd.copy(), yd.copy()
-        reach = self._reach
-        with np.errstate(all="ignore"):
-            for _ in range(_NEWTON_STEPS):
-                fx, fy, a, b, c, d = self.distort(x, y)
-                ex, ey = fx - xd, fy - yd
-                det = a * d - b * c
-                dx, dy = (d * ex - b * ey) / det, (a * ey - c * ex) / det
-                x, y = x - dx, y - dy
-                if math.isfinite(reach):  # never past the fold, from where Newton would run to another branch
-                    back = np.minimum(1.0, reach / np.maximum(np.hypot(x, y), 1e-300))
-                    x, y = x * back, y * back
-                if not np.nanmax(np.abs(dx) + np.abs(dy), initial=0.0) > 1e-15:
-                    break
-            fx, fy = self.distort(x, y)[:2]
-            good = np.hypot(fx - xd, fy - yd) < 1e-9
-        return np.where(good[..., None], np.stack([x, y], axis=-1), np.nan)
+        return np.stack(undistort(xd, yd, self.distortion), axis=-1)
 
     def to_toml(self) -> str:
         """The camera as the text of a cam.toml; numbers come back bit for bit."""

@@ -12,6 +12,8 @@ from typing import Protocol
 
 import numpy as np
 
+from ..distortion import distort, reach, undistort
+
 
 class Camera(Protocol):
     """What identification needs of a camera.
@@ -51,41 +53,25 @@ class Pinhole:
         return cls(0.5 * width / float(np.tan(0.5 * fov)), (0.5 * width, 0.5 * height), (width, height), aspect)
 
 
-def distort(u: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
-    """Distorted tangent-plane coordinates (..., 2) of ideal ones u (..., 2) = (X/Z, Y/Z)."""
-    k1, k2, p1, p2, k3 = distortion
-    x, y = u[..., 0], u[..., 1]
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-        ],
-        axis=-1,
-    )
-
-
 def ideal_pixels(camera: Camera, xy_px: np.ndarray) -> np.ndarray:
-    """(n, 2) pixels without distortion, from the principal point, y in pixel widths: focal_px times (X/Z, Y/Z)."""
+    """(n, 2) pixels without distortion, from the principal point, y in pixel widths: focal_px times (X/Z, Y/Z); NaN where the
+    lens sends no direction."""
     xy = np.asarray(xy_px, dtype=float) - np.asarray(camera.centre_px, dtype=float)
     xy = xy * np.array([1.0, camera.aspect])
     if not any(camera.distortion):
         return xy
-    measured = xy / camera.focal_px
-    u = measured
-    for _ in range(20):
-        u = u - (distort(u, camera.distortion) - measured)
-    return u * camera.focal_px
+    x, y = (xy / camera.focal_px).T
+    return np.stack(undistort(x, y, camera.distortion), axis=1) * camera.focal_px
 
 
 def image_pixels(camera: Camera, v_S: np.ndarray) -> np.ndarray:
-    """Image pixels (n, 2) of directions (n, 3) in S; NaN for those not in front of the camera."""
+    """Image pixels (n, 2) of directions (n, 3) in S; NaN for those not in front of the camera, or where the lens folds over."""
     z = np.where(v_S[:, 2] > 1e-3, v_S[:, 2], np.nan)
     u = v_S[:, :2] / z[:, None]
     if any(camera.distortion):
-        u = distort(u, camera.distortion)
+        u = np.where((u**2).sum(axis=1, keepdims=True) <= reach(camera.distortion) ** 2, u, np.nan)
+        u = np.stack(distort(u[:, 0], u[:, 1], camera.distortion)[:2], axis=1)
     return u * camera.focal_px / np.array([1.0, camera.aspect]) + np.asarray(camera.centre_px)
 
 
-__all__ = ["Camera", "Pinhole", "distort", "ideal_pixels", "image_pixels"]
+__all__ = ["Camera", "Pinhole", "ideal_pixels", "image_pixels"]

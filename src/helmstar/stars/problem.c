@@ -7,9 +7,9 @@
 
 static const double TURN = 2.0 * 3.14159265358979323846;
 
-/* The camera, the area of its image, and the constants of problem.py. */
+/* The camera, the area of its image, the constants of problem.py, and what distortion.py takes for the inverse. */
 typedef struct {
-    double centre[2], aspect, focal, distortion[5], area, magnitude_width, crowded;
+    double centre[2], aspect, focal, distortion[5], area, magnitude_width, crowded, reach, steps, agrees;
 } Eye;
 
 typedef struct {
@@ -25,24 +25,40 @@ static int brighter(const void *a, const void *b)
                                         : (x->index > y->index) - (x->index < y->index);
 }
 
-/* As `pinhole.ideal_pixels`. */
-static void ideal(const Eye *e, const double *xy, double *p)
+/* As `distortion.distort`: x', y' and their derivatives. */
+static void distort(const double *k, double x, double y, double *out)
 {
-    double x = xy[0] - e->centre[0], y = (xy[1] - e->centre[1]) * e->aspect, bent = 0.0;
+    double r2 = x * x + y * y, g = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4])), h = 2.0 * (k[0] + r2 * (2.0 * k[1] + r2 * 3.0 * k[4]));
+    out[0] = x * g + 2.0 * k[2] * x * y + k[3] * (r2 + 2.0 * x * x);
+    out[1] = y * g + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * x * y;
+    out[2] = g + h * x * x + 2.0 * k[2] * y + 6.0 * k[3] * x;
+    out[3] = out[4] = h * x * y + 2.0 * k[2] * x + 2.0 * k[3] * y;
+    out[5] = g + h * y * y + 6.0 * k[2] * y + 2.0 * k[3] * x;
+}
+
+/* As `pinhole.ideal_pixels`; 0 where the lens sends no direction. */
+static int ideal(const Eye *e, const double *xy, double *p)
+{
+    double x = xy[0] - e->centre[0], y = (xy[1] - e->centre[1]) * e->aspect, bent = 0.0, to[6];
     for (int k = 0; k < 5; k++)
         bent += fabs(e->distortion[k]);
     p[0] = x, p[1] = y;
     if (bent == 0.0)
-        return;
-    const double *d = e->distortion;
+        return 1;
     double u = x / e->focal, v = y / e->focal, mu = u, mv = v;
-    for (int k = 0; k < 20; k++) {
-        double r2 = u * u + v * v, radial = 1.0 + r2 * (d[0] + r2 * (d[1] + r2 * d[4]));
-        double du = u * radial + 2.0 * d[2] * u * v + d[3] * (r2 + 2.0 * u * u);
-        double dv = v * radial + d[2] * (r2 + 2.0 * v * v) + 2.0 * d[3] * u * v;
-        u -= du - mu, v -= dv - mv;
+    for (int k = 0; k < (int)e->steps; k++) {
+        distort(e->distortion, u, v, to);
+        double ex = to[0] - mu, ey = to[1] - mv, det = to[2] * to[5] - to[3] * to[4];
+        double du = (to[5] * ex - to[3] * ey) / det, dv = (to[2] * ey - to[4] * ex) / det;
+        u -= du, v -= dv;
+        double far = hypot(u, v), back = far > e->reach ? e->reach / far : 1.0;
+        u *= back, v *= back;
+        if (!(fabs(du) + fabs(dv) > 1e-15))
+            break;
     }
+    distort(e->distortion, u, v, to);
     p[0] = u * e->focal, p[1] = v * e->focal;
+    return hypot(to[0] - mu, to[1] - mv) < e->agrees;
 }
 
 /* As `_log_density` and `_log_place_density`. */
@@ -99,8 +115,7 @@ int64_t helmstar_prepare(
     qsort(entry, (size_t)listed, sizeof(Entry), brighter);
     for (int64_t k = 0; k < listed && count < most; k++) {
         double *at = p + 2 * count;
-        int alone = 1;
-        ideal(e, xy + 2 * entry[k].index, at);
+        int alone = ideal(e, xy + 2 * entry[k].index, at);
         for (int64_t j = 0; j < count && alone; j++)
             alone = !(fabs(p[2 * j] - at[0]) < e->crowded && fabs(p[2 * j + 1] - at[1]) < e->crowded);
         if (alone)

@@ -12,6 +12,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
+from ..distortion import AGREES, NEWTON_STEPS, reach
 from ..native import address, kernels
 from .pinhole import Camera, ideal_pixels
 
@@ -187,6 +188,8 @@ def _listed(xy: np.ndarray, C: np.ndarray, m: np.ndarray | None, camera: Camera,
     if m is not None:
         order = order[np.argsort(m[order], kind="stable")]
     p = ideal_pixels(camera, xy[order])
+    there = np.isfinite(p).all(axis=1)
+    order, p = order[there], p[there]
     keep = np.ones(len(order), dtype=bool)
     for k in np.flatnonzero(_crowded(p)):
         before = keep[:k] & (np.abs(p[:k] - p[k]).max(axis=1) < CROWDED_PX)
@@ -206,8 +209,10 @@ def _compiled(
     xy, C = np.ascontiguousarray(xy), np.ascontiguousarray(C)
     m = None if m is None else np.ascontiguousarray(m)
     (x, y), (k1, k2, p1, p2, k3) = camera.centre_px, camera.distortion
-    eye = (ctypes.c_double * 12)(
-        x, y, camera.aspect, camera.focal_px, k1, k2, p1, p2, k3, area, MAGNITUDE_WIDTH, CROWDED_PX
+    far = reach(camera.distortion) if any(camera.distortion) else math.inf
+    lens = (camera.focal_px, k1, k2, p1, p2, k3)
+    eye = (ctypes.c_double * 15)(
+        x, y, camera.aspect, *lens, area, MAGNITUDE_WIDTH, CROWDED_PX, far, NEWTON_STEPS, AGREES
     )
     room = min(len(xy), MOST_DETECTIONS)
     order, out = np.empty(room, dtype=np.int64), np.empty(11 * room + 1)

@@ -14,9 +14,9 @@ expected in the image matched, residuals r_j (px), detections of density lam (1/
 - The last factor is the price of having fitted the attitude (and focal length): the volume that the fit leaves over the volume V
   that it was chosen from, 8 pi^2 for SO(3). It takes the place of a count of tested hypotheses, and with it the odds are
   posterior odds whatever the search did. The zero point of the magnitudes and the scale s pay likewise.
-- p(m | star) is a Gaussian around the catalogue's V and zero point, with a broad share for other bands and variable stars. Where the
-  zero point is known, how well the magnitudes fit the catalogue's is not taken on trust: the odds are averaged over sigmas from an
-  eighth of the one told to four times it.
+- p(m | star) is a Gaussian around the catalogue's V and zero point, with a broad share for other bands and variable stars. Where
+  the zero point is known, how well the magnitudes fit the catalogue's is not taken on trust: the odds are averaged over sigmas
+  from an eighth of the one told to four times it.
 """
 
 from __future__ import annotations
@@ -383,8 +383,8 @@ class _Field:
         return _InC(
             n, stars, self.limit, d.magnitude is not None, d.zero_point is not None, freedom.free,
             *d.low.tolist(), *d.high.tolist(), faintest(d), d.magnitude_sigma, d.zero_point or 0.0, ZERO_POINT_RANGE,
-            BROAD_SHARE, BROAD_SIGMA, BROAD_FACTOR, freedom.f_low, freedom.f_high, freedom.f_known, 1.0 / max(freedom.sigma, 1e-6) ** 2,
-            math.log(self.volume * focal_volume(freedom)), GATE, HOPELESS,
+            BROAD_SHARE, BROAD_SIGMA, BROAD_FACTOR, freedom.f_low, freedom.f_high, freedom.f_known,
+            1.0 / max(freedom.sigma, 1e-6) ** 2, math.log(self.volume * focal_volume(freedom)), GATE, HOPELESS,
             *(listed + 8 * k for k in (0, 2 * n, 3 * n, 4 * n, 5 * n, 6 * n + 1)), r, V, *_TABLES,
             len(factors), address(factors), address(priors),
         ), arrays  # fmt: skip
