@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import beta
 
 from helmstar.stars import Pinhole, default_sky, identify
 from helmstar.stars.hypotheses import levels_for
@@ -47,6 +48,19 @@ def test_the_odds_are_those_of_each_sigma_weighed_by_its_prior():
         s = crowded(seed, 5, 20, 0.1)
         each = [weighed(s, 0.1, (factors[k : k + 1].copy(), priors[k : k + 1].copy())) for k in range(len(factors))]
         assert weighed(s, 0.1) == pytest.approx(np.logaddexp.reduce(each), abs=1e-9)
+
+
+def test_missing_stars_are_weighed_with_a_prior_that_grows_with_the_detection_probability():
+    gain, rank, expected = np.array([3.0, 2.0, 4.0]), np.array([0, 2, 5]), 9
+    vacancy = np.zeros(4)
+    depth = np.arange(1, expected + 1)
+    k = (rank[:, None] < depth).sum(axis=0)
+    likelihood = np.exp(np.concatenate([[0.0], np.cumsum(gain)])[k])
+    for complete, prior in ((False, 1), (True, 2)):
+        # The integral of prior p^(prior - 1) p^k (1 - p)^(S - k), averaged over S with weights 1/S.
+        chance = prior * beta(prior + k, 1 + depth - k)
+        mean = (likelihood * chance / depth).sum() / (1.0 / depth).sum()
+        assert weighing.log_odds(gain, rank, expected, vacancy, complete) == pytest.approx(np.log(mean), abs=1e-12)
 
 
 def test_a_sigma_told_four_times_wrong_costs_little():

@@ -266,6 +266,8 @@ static double log_odds(const Field *q, const Match *m, int64_t count, int64_t ex
         while (k < count && m[k].rank < depth)
             sum += m[k++].gain;
         total[depth] = sum + q->vacancy[k] + (factorial[k] + factorial[depth - k] - factorial[depth + 1]);
+        if (q->has_magnitude && q->knows_zero)
+            total[depth] += log(2.0 * (double)(k + 1) / (double)(depth + 2));
         top = total[depth] > top ? total[depth] : top;
     }
     for (int64_t depth = 1; depth <= expected; depth++)

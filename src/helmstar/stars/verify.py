@@ -10,7 +10,8 @@ expected in the image matched, residuals r_j (px), detections of density lam (1/
   than lam says: (n + 1)^k (n - k)! / n! with the rate of false detections integrated out.
 - The middle factor is the chance of k detections among S stars with the detection probability integrated out (uniform prior), so
   a field that misses its bright stars pays for it and one that misses 60% evenly still passes. S is unknown too: how deep the
-  image is. The odds are averaged over all S, with 1/S as prior.
+  image is. The odds are averaged over all S, with 1/S as prior. Where the zero point is known the detections tell how deep the image
+  is, and a camera that misses most of the brighter stars is odd: the prior is twice the detection probability then.
 - The last factor is the price of having fitted the attitude (and focal length): the volume that the fit leaves over the volume V
   that it was chosen from, 8 pi^2 for SO(3). It takes the place of a count of tested hypotheses, and with it the odds are
   posterior odds whatever the search did. The zero point of the magnitudes and the scale s pay likewise.
@@ -178,12 +179,17 @@ def zero_point_price(d: Detections, count: int) -> float:
     return math.log(min(1.0, math.sqrt(2.0 * math.pi) * sigma / ZERO_POINT_RANGE))
 
 
+def knows_zero(d: Detections) -> bool:
+    """Whether magnitudes are given in the catalogue's own."""
+    return d.magnitude is not None and d.zero_point is not None
+
+
 def magnitude_scales(d: Detections) -> tuple[np.ndarray, np.ndarray]:
     """Factors (h,) on the magnitudes' sigma that are to be averaged over, and the logs of their priors.
 
     A zero point that is fitted takes up most of what three or four stars tell of sigma.
     """
-    return _AS_TOLD if d.magnitude is None or d.zero_point is None else (MAGNITUDE_SCALES, LOG_MAGNITUDE_PRIORS)
+    return (MAGNITUDE_SCALES, LOG_MAGNITUDE_PRIORS) if knows_zero(d) else _AS_TOLD
 
 
 def faintest(d: Detections) -> float:
@@ -219,15 +225,17 @@ def zero_point(d: Detections, V: np.ndarray, j: np.ndarray) -> float:
     return middle(V - d.magnitude[j]) if d.zero_point is None else d.zero_point
 
 
-def log_odds(gain: np.ndarray, rank: np.ndarray, expected: int, vacancy: np.ndarray) -> float:
+def log_odds(gain: np.ndarray, rank: np.ndarray, expected: int, vacancy: np.ndarray, complete: bool = False) -> float:
     """Of the matches, without the price of the fit: gain (k,) in the order of rank (k,) among the expected stars.
 
-    The depth S has a prior of 1/S, which favours no scale.
+    The depth S has a prior of 1/S, which favours no scale. complete: the detection probability p has the prior 2 p, not 1.
     """
     depth = np.arange(1, expected + 1)
     k = np.searchsorted(rank, depth, side="left")
     # B(1 + k, 1 + S - k) = k! (S - k)! / (S + 1)!
     beta = LOG_FACTORIAL[k] + LOG_FACTORIAL[depth - k] - LOG_FACTORIAL[depth + 1]
+    if complete:  # 2 B(2 + k, 1 + S - k)
+        beta = beta + np.log(2.0 * (k + 1) / (depth + 2))
     total = (np.concatenate([[0.0], np.cumsum(gain)]) + vacancy[: len(gain) + 1])[k] + beta
     top = total.max()
     return float(top + np.log((np.exp(total - top) / depth).sum() / HARMONIC[expected]))
@@ -363,7 +371,7 @@ class _Field:
             if len(good) < 2:
                 continue
             _, information = step(p[i[good]] / f, residual[good], sigma[good], f, self.freedom)
-            total = log_odds(gain[good], i[good], expected, d.vacancy) + zero_point_price(d, len(i)) - np.log(scale)
+            total = log_odds(gain[good], i[good], expected, d.vacancy, knows_zero(d)) + zero_point_price(d, len(i)) - np.log(scale)
             total += float(fit_volumes(information[None], self.freedom, self.volume)[0]) + prior
             if best is None or total > max(odds):
                 best = good, information
