@@ -82,7 +82,9 @@ def one(k: int, seed: int) -> dict:
 
 
 def one_known(k: int, seed: int) -> dict:
-    """As `one`, with a known zero point and field: the odds that the limit for these cameras is to be drawn from."""
+    """As `one`, with a known zero point and field: the odds that the limit for these cameras is to be drawn from.
+
+    They are those of the best fit against all else, other fits too."""
     rng = np.random.default_rng([seed, k, 1])
     kind = CLASSES[k % len(CLASSES)]
     camera, xy, magnitude, star = listing(kind, rng)
@@ -92,10 +94,12 @@ def one_known(k: int, seed: int) -> dict:
         sigma_px=float(rng.choice([0.2, 0.5, 1.0])), magnitude_sigma=float(rng.choice([0.05, 0.1, 0.2, 0.4])),
     )  # fmt: skip
     seconds = time.process_time() - begin
+    p = found.probability_false
+    odds = float(np.log1p(-p) - np.log(p)) if p < 1.0 else -np.inf
     wrong = bool(found.solved and (star[found.detections] == found.stars).mean() < 0.5)
     return {
         "k": k, "class": kind, "range": False, "magnitudes": True, "n": len(xy), "false": wrong,
-        "right": found.solved and not wrong, "log_odds": float(found.log_odds), "work": found.work, "s": seconds,
+        "right": found.solved and not wrong, "log_odds": odds, "work": found.work, "s": seconds, "known": True,
     }  # fmt: skip
 
 
@@ -105,6 +109,10 @@ def run(count: int, seed: int, log: Path | None, workers: int = 1, known: bool =
     if log is not None and log.exists():
         rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
         rows = [row for row in rows if row["k"] < count]
+        if any(row.get("known", False) != known for row in rows):
+            raise SystemExit(
+                f"error: {log} is of lists {'without' if known else 'with'} a known zero point; give another file"
+            )
     done = {row["k"] for row in rows}
     left = [k for k in range(count) if k not in done]
     with Progress(True) as progress, ProcessPoolExecutor(workers) as pool:

@@ -1,6 +1,6 @@
 """Identification of stars in full-sky mode: rates, false solutions and milliseconds, on made-up centroid lists.
 
-python benchmarks/identification.py [--runs N] [--fields 12 20] [--full] [--kelvins FOLDER] [--json]
+python benchmarks/identification.py [--runs N] [--fields 12 20] [--full] [--kelvins FOLDER [--magnitude-sigma MAG]] [--json]
 python benchmarks/identification.py --false N [--known] [--log FILE] [--workers N] [--json]
 python benchmarks/identification.py --sky FOLDER [--runs N] [--json]
 
@@ -9,8 +9,8 @@ solved with most matches true, `false` counts the other solutions. --full: 300 r
 --kelvins: a folder with input.csv and result.csv of the European Kelvins contest, scored by its rule.
 It is solved with magnitudes as told, and again with zero point and scatter from its own solutions.
 --false: N lists of 5 to 400 false detections, or of skies of another camera, at fields of 5 to 25 deg; how many are called
-solved, with the upper 95% bound of the rate. --known: with a known zero point and no limit, for the tail of the
-odds. --log: continues what an earlier run left there; --workers: processes.
+solved, with the upper 95% bound of the rate. --known: with a known zero point, and up to a limit of 0.5, for the tail of the
+odds: `false` is not the rate at the default limit then. --log: continues what an earlier run left there; --workers: processes.
 --sky: rates against false stars, noise, missing stars and field over the whole sky; FOLDER gets sky.json and sky.html.
 """
 
@@ -25,7 +25,7 @@ import false_skies
 import numpy as np
 from problem import table
 
-from helmstar.stars import Pinhole, default_sky, identify
+from helmstar.stars import Photometry, Pinhole, calibrate_photometry, default_sky, identify
 from helmstar.stars.identify import LIMIT_KNOWN
 from helmstar.stars.synthetic import scene
 
@@ -65,27 +65,25 @@ def monte_carlo(fov_deg: float, runs: int, seed: int, magnitudes: bool, fov_rang
     }
 
 
-def kelvins(folder: Path, limit: float | None) -> dict[str, dict[str, float]]:
+def kelvins(folder: Path, limit: float | None, magnitude_sigma: float = 0.05) -> dict[str, dict[str, float]]:
     """The contest's score of 100 scenes, with magnitudes as told, and with what the scenes solved so tell of them, as one would
     calibrate a camera on its own frames: no answer is used for that."""
-    told = kelvins_scored(folder, limit, 0.0, 0.05)
-    difference = told.pop("differences")
-    zero = float(np.median(difference))
-    sigma = 1.4826 * float(np.median(np.abs(difference - zero)))
-    own = kelvins_scored(folder, limit, zero, sigma)
-    own.pop("differences")
-    return {"as told": told, f"zero point {zero:.3f}, sigma {sigma:.3f}": own}
+    told, camera = kelvins_scored(folder, limit, 0.0, magnitude_sigma)
+    own, _ = kelvins_scored(folder, limit, camera.zero_point, camera.magnitude_sigma)
+    return {"as told": told, f"zero point {camera.zero_point:.3f}, sigma {camera.magnitude_sigma:.3f}": own}
 
 
-def kelvins_scored(folder: Path, limit: float | None, zero_point: float, magnitude_sigma: float) -> dict:
-    """Score, and V minus magnitude of all matches: y upwards.
+def kelvins_scored(
+    folder: Path, limit: float | None, zero_point: float, magnitude_sigma: float
+) -> tuple[dict[str, float], Photometry]:
+    """Score, and what the solutions tell of the magnitudes: y upwards.
 
     The field (DEG_X) and the variance of positions (POS_VARIANCE) are those of the contest's own calibration file.
     """
     camera = Pinhole.of_field(float(np.radians(10.0)), (1920, 1440))
     scenes = [np.array(line.split(","), dtype=float).reshape(-1, 3) for line in _lines(folder / "input.csv")]
     truths = [np.array(line.split(","), dtype=int) for line in _lines(folder / "result.csv")]
-    score, wrong, solved, ms, differences = 0.0, 0, 0, [], []
+    score, wrong, ms, answers = 0.0, 0, [], []
     for s, truth in zip(scenes, truths):
         xy = np.stack([s[:, 0], 1440.0 - s[:, 1]], axis=1)
         begin = time.perf_counter()
@@ -100,17 +98,16 @@ def kelvins_scored(folder: Path, limit: float | None, zero_point: float, magnitu
             limit=limit,
         )
         ms.append(1e3 * (time.perf_counter() - begin))
-        differences.append(default_sky().magnitude[found.stars] - s[found.detections, 2])
+        answers.append(found)
         answer = np.full(len(truth), -1)
         answer[found.detections] = found.hip
         true, answered = truth >= 0, answer >= 0
         bad = int((answered & (answer != truth)).sum())
         score += max((int((answered & (answer == truth)).sum()) - 2 * bad) / max(int(true.sum()), 1), -1.0)
-        wrong, solved = wrong + (bad > 0), solved + found.solved
-    return {
-        "score": score, "solved": solved, "with_wrong": wrong, "ms_median": float(np.median(ms)), "ms_max": max(ms),
-        "differences": np.concatenate(differences),
-    }  # fmt: skip
+        wrong += bad > 0
+    solved = sum(found.solved for found in answers)
+    row = {"score": score, "solved": solved, "with_wrong": wrong, "ms_median": float(np.median(ms)), "ms_max": max(ms)}
+    return row, calibrate_photometry(answers, [s[:, 2] for s in scenes])
 
 
 def _lines(path: Path) -> list[str]:
@@ -156,6 +153,7 @@ def main() -> None:
     parser.add_argument("--sky", type=Path, metavar="FOLDER")
     parser.add_argument("--full", action="store_true")
     parser.add_argument("--kelvins", type=Path)
+    parser.add_argument("--magnitude-sigma", type=float, default=0.05, metavar="MAG")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     if args.false or args.sky:
@@ -181,7 +179,7 @@ def main() -> None:
     out: dict = {"cases": rows}
     if args.kelvins:
         for limit in (None, 0.01):
-            for magnitudes, row in kelvins(args.kelvins, limit).items():
+            for magnitudes, row in kelvins(args.kelvins, limit, args.magnitude_sigma).items():
                 out[f"kelvins, limit {limit or LIMIT_KNOWN:g}, magnitudes {magnitudes}"] = row
     if args.json:
         print(json.dumps(out))

@@ -9,6 +9,7 @@ Coefficients are (k1, k2, p1, p2, k3), OpenCV's order and sense.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ def distort(x: Any, y: Any, coefficients: Coefficients) -> tuple[Any, ...]:
     return xd, yd, g + h * x * x + 2 * p1 * y + 6 * p2 * x, cross, cross, g + h * y * y + 6 * p1 * y + 2 * p2 * x
 
 
+@lru_cache(maxsize=64)
 def reach(coefficients: Coefficients) -> float:
     """The radius sqrt(x^2 + y^2) up to which the radial distortion grows; infinite for most lenses."""
     k1, k2, _, _, k3 = coefficients
@@ -50,7 +52,11 @@ def reach(coefficients: Coefficients) -> float:
 
 
 def undistort(xd: np.ndarray, yd: np.ndarray, coefficients: Coefficients) -> tuple[np.ndarray, np.ndarray]:
-    """x, y of distorted places, arrays of one shape: Newton's method, started there. NaN where there is no inverse."""
+    """x, y of distorted places, arrays of one shape: Newton's method, started there.
+
+    NaN where there is no inverse; and at some places far out of lenses that bend by more than a third and back (k1 > 0.4 with
+    k3 < -0.2, say), where Newton's method finds none.
+    """
     x, y, far = np.array(xd, dtype=float), np.array(yd, dtype=float), reach(coefficients)
     with np.errstate(all="ignore"):
         for _ in range(NEWTON_STEPS):

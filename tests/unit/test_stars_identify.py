@@ -194,6 +194,27 @@ def test_distortion_comes_off():
     assert np.allclose(ideal_pixels(c, image_pixels(c, v)), 2000.0 * v[:, :2], atol=1e-8)
 
 
+def test_a_sought_field_takes_no_notice_of_the_lens_of_another():
+    c = camera(12.0)
+    s = scene(default_sky(), c, np.random.default_rng(14))
+    wide = np.radians([10.0, 14.0])
+    bent = Pinhole(300.0, c.centre_px, c.size_px, 1.0, (-0.3, 0.0, 0.0, 0.0, 0.0))
+    a, b = (identify(s.xy_px, one, flux=s.flux, sigma_px=0.3, fov_range=tuple(wide)) for one in (c, bent))
+    assert b.solved
+    assert np.array_equal(a.q_SN, b.q_SN)
+
+
+def test_what_is_no_lens_or_zero_point_is_named():
+    c = camera(12.0)
+    xy, m = np.zeros((3, 2)), np.zeros(3)
+    for k3 in (np.nan, np.inf):
+        bent = Pinhole(c.focal_px, c.centre_px, c.size_px, 1.0, (0.1, 0.0, 0.0, 0.0, k3))
+        with pytest.raises(ValueError, match="distortion"):
+            identify(xy, bent)
+    with pytest.raises(ValueError, match="zero_point"):
+        identify(xy, c, magnitude=m, zero_point=np.nan)
+
+
 @pytest.mark.parametrize(
     "distortion", [(0.9, 0.3, 2e-3, -1e-3, 0.1), (-0.25, 0.08, 0.0, 0.0, -0.01), (-0.3, 0.0, 0.0, 0.0, 0.0)]
 )

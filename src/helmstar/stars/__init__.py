@@ -7,6 +7,7 @@ from .catalog import Catalog, load_catalog
 from .doubt import Doubted, identify_uncalibrated
 from .identify import Identification, default_sky, identify
 from .patterns import Sky
+from .photometry import Photometry, calibrate_photometry
 from .pinhole import Camera, Pinhole
 from .track import track
 
@@ -15,8 +16,10 @@ __all__ = [
     "Catalog",
     "Doubted",
     "Identification",
+    "Photometry",
     "Pinhole",
     "Sky",
+    "calibrate_photometry",
     "default_sky",
     "identify",
     "identify_uncalibrated",

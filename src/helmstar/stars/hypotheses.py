@@ -97,7 +97,7 @@ def hypotheses(
 
 def thinned(table: Pairs, V: np.ndarray, d: Detections) -> Pairs:
     """Without the stars that are too faint for any detection, where the zero point is known."""
-    if d.zero_point is None or d.magnitude is None:
+    if not d.knows_zero:
         return table
     keep = np.flatnonzero(table.second < np.searchsorted(V, d.faintest, side="right"))
     return Pairs(table.first[keep], table.second[keep], table.angle[keep])

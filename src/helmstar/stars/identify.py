@@ -13,10 +13,10 @@ from ..attitude import quaternion_of_matrix
 from .catalog import load_catalog
 from .hypotheses import CHUNK, FIRST_CHUNK, Hypotheses
 from .patterns import BRIGHT, BRIGHTEST, FAINT, Sky
-from .pinhole import Camera
+from .pinhole import Camera, Pinhole
 from .problem import Detections, Fit, Freedom, prepare
 from .screen import Raster, raster, screen
-from .stage import Stage, stages
+from .stage import Stage, detection_pairs, stages
 from .verify import HOPELESS, jacobian, probability_false, turn, verify
 
 Status = Literal["solved", "too few stars", "no match", "uncertain"]
@@ -32,7 +32,8 @@ KEPT = 5
 DEPTHS = ((BRIGHTEST, 1.0), (BRIGHT, 1.0), (FAINT, 0.15))
 """Pair tables with how probable it is that they lead to a solution which the others miss. The first is for unknown fields."""
 SEARCHED = ((1.0, 1.0), (0.25, 0.5), (2.5, 0.5))
-"""Factors on the magnitudes' sigma that the search takes where the zero point is known, and how probable each is."""
+"""Factors on the magnitudes' sigma that the search takes where the zero point is known, and how much each is worth beside the one
+that was told; what is told is searched as deeply as without the others."""
 WORTH = tuple(1.2e-8 * 2.0**k for k in range(10, -1, -1))
 """Solutions that a look at one more catalogue pair must promise, from first to last (`stage.Stage`)."""
 WORK = 6_000_000
@@ -102,22 +103,26 @@ def identify(
     xy_px: (n, 2) image pixels. flux (n,) > 0 or magnitude (n,): brightness in any band and unit, the order matters most; without
     them the list is taken as it comes. sigma_px: 1 sigma per axis, a number, (n,), or covariances (n, 2, 2).
     camera: its focal length and distortion do not count when fov_range, horizontal full fields (rad), is given; focal_sigma:
-    relative 1 sigma of its focal length otherwise. magnitude_sigma: 1 sigma of V minus (magnitude + zero point); zero_point: where
-    it is known. q_SB: (4,) mounting. limit: largest probability_false of what is called solved, LIMIT by default, LIMIT_KNOWN where
-    zero point and field are known. work: catalogue pairs to look at before giving up.
+    relative 1 sigma of its focal length otherwise. magnitude_sigma: 1 sigma of V minus (magnitude + zero point), a first guess
+    where the zero point is known; zero_point: where it is (`calibrate_photometry`). q_SB: (4,) mounting. limit: largest
+    probability_false of what is called solved, LIMIT by default, LIMIT_KNOWN where zero point and field are known. work:
+    catalogue pairs to look at before giving up.
 
-    Entries that are not finite are left out. Raises ValueError for shapes, ranges and parameters that mean nothing.
+    Entries that are not finite are left out, and places that no direction reaches through the camera's distortion. Raises
+    ValueError for shapes, ranges and parameters that mean nothing.
     """
-    d, covariances = prepare(xy_px, camera, flux, magnitude, sigma_px, magnitude_sigma, zero_point)
     freedom = focal_freedom(camera, fov_range, focal_sigma)
+    if fov_range is not None:  # the distortion is in units of a focal length that is not known
+        camera = Pinhole(1.0, camera.centre_px, camera.size_px, camera.aspect)
+    d, covariances = prepare(xy_px, camera, flux, magnitude, sigma_px, magnitude_sigma, zero_point)
     if q_SB is not None:
         q_SB = unit_quaternion("q_SB", q_SB)
     if limit is None:
-        limit = LIMIT if d.zero_point is None or d.magnitude is None or freedom.free else LIMIT_KNOWN
+        limit = LIMIT_KNOWN if d.knows_zero and not freedom.free else LIMIT
     if not 0.0 < limit < 1.0:
         raise ValueError(f"limit {limit}: must be between 0 and 1")
     sky = default_sky() if sky is None else sky
-    fewest = 2 if d.zero_point is not None and d.magnitude is not None and not freedom.free else FEWEST
+    fewest = 2 if d.knows_zero and not freedom.free else FEWEST
     if len(d) < fewest:
         return unsolved("too few stars", 0)
     fits, done = search(sky, d, freedom, fewest, limit, work)
@@ -149,7 +154,8 @@ def search(sky: Sky, d: Detections, freedom: Freedom, fewest: int, limit: float,
     fits: list[Fit] = []
     done = 0
     depths = [(n, prior) for n, prior in DEPTHS if freedom.free or n != BRIGHTEST]
-    tables = [stage for own, share in as_bright(d) for stage in stages(sky, own, freedom, depths, share)]
+    pairs = detection_pairs(d)
+    tables = [s for own, weight in with_other_sigmas(d) for s in stages(sky, own, pairs, freedom, depths, weight)]
     cells = raster(d)
     for worth in WORTH:
         for stage in tables:
@@ -162,12 +168,12 @@ def search(sky: Sky, d: Detections, freedom: Freedom, fewest: int, limit: float,
     return fits, done
 
 
-def as_bright(d: Detections) -> list[tuple[Detections, float]]:
-    """The detections as the search takes them, and how probable each is: with other sigmas of the magnitudes where the zero point
-    is known. Twice too narrow a sigma hides true stars among those that do not fit, too wide a one among those that do."""
-    if d.zero_point is None or d.magnitude is None:
+def with_other_sigmas(d: Detections) -> list[tuple[Detections, float]]:
+    """The detections as the search takes them, and the weights of each: with other sigmas of the magnitudes where the zero point
+    is known. Too narrow a sigma hides true pairs among those that do not fit, too wide a one among those that do."""
+    if not d.knows_zero:
         return [(d, 1.0)]
-    return [(replace(d, magnitude_sigma=factor * d.magnitude_sigma), share) for factor, share in SEARCHED]
+    return [(replace(d, magnitude_sigma=factor * d.magnitude_sigma), weight) for factor, weight in SEARCHED]
 
 
 def weigh(

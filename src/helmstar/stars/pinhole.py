@@ -55,7 +55,7 @@ class Pinhole:
 
 def ideal_pixels(camera: Camera, xy_px: np.ndarray) -> np.ndarray:
     """(n, 2) pixels without distortion, from the principal point, y in pixel widths: focal_px times (X/Z, Y/Z); NaN where the
-    lens sends no direction."""
+    lens sends no direction (`undistort`)."""
     xy = np.asarray(xy_px, dtype=float) - np.asarray(camera.centre_px, dtype=float)
     xy = xy * np.array([1.0, camera.aspect])
     if not any(camera.distortion):

@@ -62,6 +62,11 @@ class Detections:
         """
         return _vacancy(len(self.xy))
 
+    @property
+    def knows_zero(self) -> bool:
+        """Whether the magnitudes are given in the catalogue's own."""
+        return self.magnitude is not None and self.zero_point is not None
+
     @cached_property
     def faintest(self) -> float:
         """V of the faintest star that may be among them: where the zero point is known, infinity elsewhere."""
@@ -138,6 +143,10 @@ def prepare(
     zero_point: float | None,
 ) -> tuple[Detections, np.ndarray]:
     """Detections in ideal pixels, brightest first, and their covariances (n, 2, 2). Raises ValueError for what means nothing."""
+    if not np.isfinite(camera.distortion).all():
+        raise ValueError(f"distortion {camera.distortion}: must be five numbers, k1, k2, p1, p2, k3")
+    if zero_point is not None and not math.isfinite(zero_point):
+        raise ValueError(f"zero_point {zero_point}: must be a number, or None where it is unknown")
     xy = np.asarray(xy_px, dtype=float)
     if xy.size == 0:
         xy = xy.reshape(0, 2)

@@ -1,7 +1,9 @@
 """A first weighing of many hypotheses at once: what `verify` does in its first two rounds, in a few array operations for all.
 
-A list that shows no sky has thousands of hypotheses that hit something by chance. Weighed one by one they would take most of the
-time that a refusal takes. Stars find their detections through a raster, so that a hypothesis costs its number of stars.
+A list that shows no sky has thousands of hypotheses that hit something by chance. Weighed one by one they would take most of
+the time that a refusal takes. Stars find their detections through a raster, so that a hypothesis costs its number of stars. It
+only sorts, and drops what is hopeless: how well magnitudes fit is taken as told here, and the prior of the detection
+probability as even.
 """
 
 from __future__ import annotations

@@ -80,7 +80,12 @@ def detection_pairs(d: Detections) -> np.ndarray:
 
 
 def stages(
-    sky: Sky, d: Detections, freedom: Freedom, depths: Sequence[tuple[int, float]], probable: float = 1.0
+    sky: Sky,
+    d: Detections,
+    pairs: np.ndarray,
+    freedom: Freedom,
+    depths: Sequence[tuple[int, float]],
+    weight: float = 1.0,
 ) -> list[Stage]:
     """Of each depth (n stars per field, prior) the fields that the focal length allows, the widest first: their tables are small.
 
@@ -88,13 +93,13 @@ def stages(
     fields from being searched deeply. With priors as 1/field^2 all would be searched equally deep, with even ones the narrow fields
     hardly; 1/field lies between.
     """
-    pairs, levels = detection_pairs(d), levels_for(d, freedom, LADDER)
+    levels = levels_for(d, freedom, LADDER)
     share = [1.0]
     if len(levels) > 1:
         width = np.array([np.log(part.f_high / part.f_low) / LADDER[level] for level, part in levels])
         share = (width / width.sum()).tolist()
     return [
-        Stage(sky, n, d, pairs, level, part, probable * prior * own)
+        Stage(sky, n, d, pairs, level, part, weight * prior * own)
         for n, prior in depths
         for (level, part), own in reversed(list(zip(levels, share)))
     ]

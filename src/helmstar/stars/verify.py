@@ -3,15 +3,16 @@
 The hypothesis "attitude R, focal length f" is weighed against "every detection is false". With k of the S catalogue stars
 expected in the image matched, residuals r_j (px), detections of density lam (1/px^2) and magnitudes m_j,
 
-    odds = prod_j [ N(r_j; s^2 C_j) p(m_j | star) / (lam p(m_j)) ]  B(1 + k, 1 + S - k) / B(1, 1)
+    odds = prod_j [ N(r_j; s^2 C_j) p(m_j | star) / (lam p(m_j)) ]  B(a + k, 1 + S - k) / B(a, 1)
            x sqrt(det 2 pi P) / V.
 
 - lam is the detections' own density, smoothed, so that a clump of false ones is no wonder. With k matches the others are fewer
   than lam says: (n + 1)^k (n - k)! / n! with the rate of false detections integrated out.
-- The middle factor is the chance of k detections among S stars with the detection probability integrated out (uniform prior), so
-  a field that misses its bright stars pays for it and one that misses 60% evenly still passes. S is unknown too: how deep the
-  image is. The odds are averaged over all S, with 1/S as prior. Where the zero point is known the detections tell how deep the image
-  is, and a camera that misses most of the brighter stars is odd: the prior is twice the detection probability then.
+- The middle factor is the chance of k detections among S stars with the detection probability integrated out (uniform prior,
+  a = 1), so a field that misses its bright stars pays for it and one that misses 60% evenly still passes. S is unknown too: how
+  deep the image is. The odds are averaged over all S, with 1/S as prior. Where the zero point is known the detections tell how
+  deep the image is, and a camera that misses most of the brighter stars is odd: the prior is twice the detection probability
+  then, a = 2.
 - The last factor is the price of having fitted the attitude (and focal length): the volume that the fit leaves over the volume V
   that it was chosen from, 8 pi^2 for SO(3). It takes the place of a count of tested hypotheses, and with it the odds are
   posterior odds whatever the search did. The zero point of the magnitudes and the scale s pay likewise.
@@ -52,7 +53,7 @@ _weights = np.exp2(-np.abs(np.log2(MAGNITUDE_SCALES)))
 LOG_MAGNITUDE_PRIORS = np.log(_weights / _weights.sum())
 """Of these: what was told is the likeliest, each factor of two half as likely as the one before."""
 ODD_MAGNITUDES = 0.1
-"""1 sigma, mag, that single stars may always be off by where the zero point is known: variables, doubles, other bands."""
+"""1 sigma, mag, that how faint a star may be is always uncertain by where the zero point is known: variables, doubles, bands."""
 _AS_TOLD = np.ones(1), np.zeros(1)
 GATE = 3.6
 """Residuals of matches, over sigma."""
@@ -179,21 +180,16 @@ def zero_point_price(d: Detections, count: int) -> float:
     return math.log(min(1.0, math.sqrt(2.0 * math.pi) * sigma / ZERO_POINT_RANGE))
 
 
-def knows_zero(d: Detections) -> bool:
-    """Whether magnitudes are given in the catalogue's own."""
-    return d.magnitude is not None and d.zero_point is not None
-
-
 def magnitude_scales(d: Detections) -> tuple[np.ndarray, np.ndarray]:
     """Factors (h,) on the magnitudes' sigma that are to be averaged over, and the logs of their priors.
 
     A zero point that is fitted takes up most of what three or four stars tell of sigma.
     """
-    return (MAGNITUDE_SCALES, LOG_MAGNITUDE_PRIORS) if knows_zero(d) else _AS_TOLD
+    return (MAGNITUDE_SCALES, LOG_MAGNITUDE_PRIORS) if d.knows_zero else _AS_TOLD
 
 
-def faintest(d: Detections) -> float:
-    """V of the faintest star that is looked for."""
+def faintest_sought(d: Detections) -> float:
+    """V of the faintest star that is looked for: one that is a little fainter than sigma allows may match with a wider sigma."""
     return d.faintest_at(math.hypot(1.0, ODD_MAGNITUDES / d.magnitude_sigma))
 
 
@@ -320,7 +316,7 @@ class _Field:
         d, freedom, zero = self.d, self.freedom, self.d.zero_point
         for turn_number in range(rounds + 1):
             p, _ = project(self.r, R, f)
-            seen = np.flatnonzero(inside(p, d.low, d.high) & (faintest(d) >= self.V))[: self.limit]
+            seen = np.flatnonzero(inside(p, d.low, d.high) & (faintest_sought(d) >= self.V))[: self.limit]
             p = p[seen]
             widen = 1.0 if turn_number == rounds else (first_gate, 0.5 * (1.0 + first_gate), 1.0)[min(turn_number, 2)]
             excess = None
@@ -371,7 +367,11 @@ class _Field:
             if len(good) < 2:
                 continue
             _, information = step(p[i[good]] / f, residual[good], sigma[good], f, self.freedom)
-            total = log_odds(gain[good], i[good], expected, d.vacancy, knows_zero(d)) + zero_point_price(d, len(i)) - np.log(scale)
+            total = (
+                log_odds(gain[good], i[good], expected, d.vacancy, d.knows_zero)
+                + zero_point_price(d, len(i))
+                - np.log(scale)
+            )
             total += float(fit_volumes(information[None], self.freedom, self.volume)[0]) + prior
             if best is None or total > max(odds):
                 best = good, information
@@ -390,7 +390,7 @@ class _Field:
         factors, priors = magnitude_scales(d)
         return _InC(
             n, stars, self.limit, d.magnitude is not None, d.zero_point is not None, freedom.free,
-            *d.low.tolist(), *d.high.tolist(), faintest(d), d.magnitude_sigma, d.zero_point or 0.0, ZERO_POINT_RANGE,
+            *d.low.tolist(), *d.high.tolist(), faintest_sought(d), d.magnitude_sigma, d.zero_point or 0.0, ZERO_POINT_RANGE,
             BROAD_SHARE, BROAD_SIGMA, BROAD_FACTOR, freedom.f_low, freedom.f_high, freedom.f_known,
             1.0 / max(freedom.sigma, 1e-6) ** 2, math.log(self.volume * focal_volume(freedom)), GATE, HOPELESS,
             *(listed + 8 * k for k in (0, 2 * n, 3 * n, 4 * n, 5 * n, 6 * n + 1)), r, V, *_TABLES,
