@@ -25,7 +25,7 @@ FEWEST = 3
 """Stars that a solution must match; with a known zero point of magnitudes 2 may do."""
 LIMIT = 1e-5
 """Default of the largest probability that a solution is false: a tenth of the share of false solutions that is borne, 1e-4."""
-LIMIT_KNOWN = 3e-3
+LIMIT_KNOWN = 2e-3
 """The same where the zero point of the magnitudes and the field are known, and the odds' tail is thin (docs/stars.md)."""
 KEPT = 5
 """Hypotheses of each chunk that are screened."""
