@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 from pathlib import Path
 
@@ -116,13 +117,23 @@ def test_other_processes_give_the_same_bits(eleven, tmp_path, monkeypatch):
     assert same_bits(outcome.dataset, eleven.dataset)
 
 
-def test_a_dask_cluster_gives_the_same_bits(eleven, tmp_path):
+def test_a_dask_cluster_gives_the_same_bits(eleven, tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed", reason="the dask extra is not installed: this test did not run")
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
     ) as cluster:
+        config, schedulers, save = importlib.import_module("dask.config"), [], Store.save
+
+        def kept(store, *args):
+            schedulers.append(config.get("scheduler", None))
+            save(store, *args)
+
+        monkeypatch.setattr(Store, "save", kept)
         outcome = run(tmp_path, 11, dask=cluster.scheduler_address)
     assert same_bits(outcome.dataset, eleven.dataset)
+    # A default client would be asked for a lock of every file that is written, by this campaign and by all later ones.
+    assert set(schedulers) == {None}
+    assert config.get("scheduler", None) is None
 
 
 def test_a_dask_address_without_a_scheduler(tmp_path, monkeypatch):

@@ -236,7 +236,8 @@ def _compute_on_dask(
         raise CampaignError('--dask needs the extra: pip install "helmstar[dask]"') from error
     task = bar.add(f"{runs} runs on {address}", len(todo))
     try:
-        client = Client(address, timeout=10)
+        # Not the process's default: xarray would ask a default one for a lock of every file, also when it is just closing.
+        client = Client(address, timeout=10, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise CampaignError(f"--dask {address}: no scheduler answers there ({error})") from error
     with client, client.get_executor(pure=False) as pool:

@@ -10,9 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -26,18 +24,6 @@ from .engine import Block
 
 KEPT_BYTES = 2**28
 """How much of what was just written stays in memory, so that it need not be read again."""
-
-
-@contextmanager
-def _without_a_cluster() -> Iterator[None]:
-    """Files are written by this process alone: xarray would ask a Dask cluster for the lock wherever a client is open, and fail
-    with one that is just closing."""
-    config = sys.modules.get("dask.config")
-    if config is None:
-        yield
-        return
-    with config.set(scheduler="threads"):
-        yield
 
 
 def fingerprint(manifest: dict[str, Any]) -> str:
@@ -116,7 +102,7 @@ class Store:
         """Keep a finished block."""
         ds = _dataset(block, experiment)
         path = self._path(block.index)
-        with replacing(path) as part, _without_a_cluster():
+        with replacing(path) as part:
             ds.to_netcdf(part, engine="h5netcdf")
         if ds.nbytes <= self._room:
             self._room -= ds.nbytes
