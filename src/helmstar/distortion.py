@@ -76,7 +76,7 @@ def undistort(xd: np.ndarray, yd: np.ndarray, coefficients: Coefficients) -> tup
 
 
 def undistort_one(xd: float, yd: float, coefficients: Coefficients, far: float) -> tuple[float, float]:
-    """As `undistort`, of one place in plain numbers, which takes a tenth of the time; far: `reach`."""
+    """As `undistort`, of one place in plain numbers, which takes a thirtieth of the time; far: `reach`."""
     x, y = xd, yd
     try:
         for _ in range(NEWTON_STEPS):

@@ -12,6 +12,7 @@ from scipy.special import beta
 from helmstar.stars import Pinhole, calibrate_photometry, default_sky, identify
 from helmstar.stars.hypotheses import levels_for
 from helmstar.stars.identify import LIMIT_KNOWN, focal_freedom
+from helmstar.stars.magnitudes import LOG_MAGNITUDE_PRIORS, MAGNITUDE_SCALES, magnitude_scales
 from helmstar.stars.patterns import LADDER
 from helmstar.stars.problem import prepare
 from helmstar.stars.synthetic import Scene, scene
@@ -42,7 +43,7 @@ def weighed(s: Scene, sigma: float, factors: tuple[np.ndarray, np.ndarray] | Non
 
 
 def test_the_odds_are_those_of_each_sigma_weighed_by_its_prior():
-    factors, priors = weighing.MAGNITUDE_SCALES, weighing.LOG_MAGNITUDE_PRIORS
+    factors, priors = MAGNITUDE_SCALES, LOG_MAGNITUDE_PRIORS
     assert np.exp(priors).sum() == pytest.approx(1.0, abs=1e-12)
     for seed in range(6):
         s = crowded(seed, 5, 20, 0.1)
@@ -93,9 +94,9 @@ def test_a_sigma_told_four_times_wrong_costs_little():
 def test_without_a_known_zero_point_sigma_is_believed():
     s = crowded(1, 6, 20, 0.1)
     d, _ = prepare(s.xy_px, CAMERA, None, s.magnitude, 0.2, 0.1, None)
-    factors, priors = weighing.magnitude_scales(d)
+    factors, priors = magnitude_scales(d)
     assert (factors.tolist(), priors.tolist()) == ([1.0], [0.0])
-    assert weighing.magnitude_scales(replace(d, magnitude=None, zero_point=0.0))[0].tolist() == [1.0]
+    assert magnitude_scales(replace(d, magnitude=None, zero_point=0.0))[0].tolist() == [1.0]
 
 
 @pytest.mark.parametrize(("told", "noise"), [(0.4, 0.03), (0.05, 0.15)])

@@ -14,25 +14,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..native import address, kernels
+from .magnitudes import BROAD_SHARE, ZERO_POINT_RANGE, broad_sigma, magnitude_gain, zero_point_price
 from .patterns import Sky
 from .problem import Detections, Freedom
 from .verify import (
-    BROAD_SHARE,
     GATE,
     HARMONIC,
     LOG_FACTORIAL,
     SO3_VOLUME,
-    ZERO_POINT_RANGE,
-    broad_sigma,
     deepest,
     fit_volumes,
     focal_volume,
     inside,
     log_odds,
-    magnitude_gain,
     stars_near,
     turns,
-    zero_point_price,
 )
 
 FIRST_GATE, SECOND_GATE = 4.0, 2.5
