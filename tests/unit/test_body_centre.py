@@ -28,11 +28,11 @@ from helmstar.imaging.body import (
     windowed_centroid,
 )
 from helmstar.imaging.body.centre import find_centre
-from helmstar.imaging.body.correlate import centre_from_fit
 from helmstar.imaging.body.limb import centre_from_limb
 from helmstar.imaging.body.moment import sky_of
 from helmstar.imaging.body.phase import lambert_factor
 from helmstar.imaging.body.render_body import body_light
+from helmstar.imaging.body.template_fit import centre_from_fit
 from helmstar.imaging.render import Exposure, sensor_counts
 
 CAMERA = Camera.from_fov(3.5, 1024, 1024)

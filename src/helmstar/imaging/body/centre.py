@@ -8,11 +8,11 @@ import numpy as np
 
 from ..camera import Camera
 from ..frame import Image
-from .correlate import centre_from_fit
 from .limb import centre_from_limb
 from .moment import centre_of_centroid, windowed_centroid
 from .shape import Ellipsoid
 from .target import FOUND, Detector, FigureCentre, Pose, Target
+from .template_fit import centre_from_fit
 
 MOMENT_BELOW_PX = 5.0
 LIMB_ABOVE_PX = 400.0

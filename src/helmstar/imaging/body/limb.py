@@ -141,7 +141,7 @@ def centre_from_limb(
     image: Image, camera: Camera, target: Target, pose: Pose, detector: Detector | None = None, *,
     corner: tuple[int, int] = (0, 0), centroid: Centroid | None = None,
 ) -> FigureCentre:  # fmt: skip
-    """Centre of figure from the limb of an ellipsoid of at least LEAST_PX; arguments, statuses as `correlate.centre_from_fit`."""
+    """Centre of figure from the limb of an ellipsoid of at least LEAST_PX; arguments, statuses as `centre_from_fit`."""
     detector = detector or Detector()
     scene = Scene(camera, target, pose, detector.psf_sigma_px)
     diameter = scene.diameter_px()
@@ -166,7 +166,7 @@ def centre_from_limb(
         )
     g = preprocess(image)
     data = data_of(image, g.grey, g.noise, corner)
-    from .correlate import coarse
+    from .template_fit import coarse
 
     search = diameter if centroid.status in (CUT, SATURATED) else None
     trial = coarse(data, scene, Trial(centroid.xy_px - offset), detector, search)
